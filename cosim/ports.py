@@ -1,0 +1,129 @@
+"""What the loop needs of the engines and of a policy: protocols of a few methods each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.events import EventQuery, EventReply
+from cosim.geometry import Floats, Polyline, Pose
+from cosim.scenario import Scenario
+from cosim.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSpec:
+    """A policy's camera: size in pixels, vertical field of view in degrees, mount on the robot's base frame."""
+
+    width: int = 96
+    height: int = 96
+    fov_deg: float = 75.0
+    mount_m: tuple[float, float, float] = (0.30, 0.0, 0.62)
+    pitch_down_deg: float = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Privileged:
+    """What the simulator knows and a camera does not; given only to policies that declare it.
+
+    route_s_m: the robot's arc length on the route. stops_m: for each crossing of the route its (id, enter, leave)
+    arc lengths.
+    """
+
+    robot: RobotState
+    route: Polyline
+    route_s_m: float
+    people: People
+    vehicles: Vehicles
+    signals: Mapping[str, Signal]
+    crossings: tuple[tuple[str, float, float], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds."""
+
+    tick: int
+    time_s: float
+    rgb: NDArray[np.uint8] | None
+    v_mps: float
+    w_radps: float
+    privileged: Privileged | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a policy says of itself. rate_hz: how often it acts; waypoint_dt_s: time between its waypoints."""
+
+    name: str
+    version: str = "1"
+    rate_hz: float = 4.0
+    camera: CameraSpec | None = CameraSpec()
+    privileged: bool = False
+    waypoint_dt_s: float = 0.25
+
+
+class Policy(Protocol):
+    """A navigation policy. One object lives through many episodes; `reset` comes before each."""
+
+    @property
+    def manifest(self) -> Manifest: ...
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """A new episode begins. Anything random must come from `seed`."""
+
+    def act(self, observation: Observation) -> Command | NDArray[np.floating]:
+        """A command, or waypoints (N, 2): x forward, y left, metres in the robot's frame."""
+
+
+class Crowd(Protocol):
+    """Everything that moves but the robot."""
+
+    @property
+    def street(self) -> Street:
+        """The street now."""
+
+    def step(self, robot: RobotState, reply: EventReply) -> Street:
+        """One tick on, with the robot and the event pedestrians where they are now."""
+
+
+class World(Protocol):
+    """The physics of the robot."""
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width of the robot."""
+
+    def place(self, pose: Pose) -> RobotState:
+        """Put the robot at rest at a pose."""
+
+    def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
+        """One tick of physics; people and vehicles move evenly from `before` to `after`."""
+
+
+class Camera(Protocol):
+    """Draws what the robot sees."""
+
+    def render(self, robot: RobotState, street: Street) -> Frame: ...
+
+
+class Director(Protocol):
+    """Moves the event pedestrians."""
+
+    def react(self, query: EventQuery) -> EventReply: ...
+
+
+class Sink(Protocol):
+    """Something that looks on while an episode runs."""
+
+    def progress(self, scenario: Scenario, time_s: float, route_s_m: float) -> None: ...
+
+
+__all__ = [
+    "Camera", "CameraSpec", "Crowd", "Director", "Floats", "Manifest", "Observation", "Policy", "Privileged",
+    "Sink", "World",
+]  # fmt: skip

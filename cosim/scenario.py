@@ -1,0 +1,158 @@
+"""Scenario and Suite: frozen specs of what is measured, and their files.
+
+A spec is complete: the same spec gives the same episode, bit for bit, in any process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from cosim.errors import SpecError
+from cosim.events import Event
+from cosim.geometry import Polyline, Pose
+
+SCHEMA = 1
+"""Version of the scenario files; a reader refuses others."""
+
+
+class City(msgspec.Struct, frozen=True, kw_only=True, tag="city", tag_field="kind"):
+    """A procedural city. net_hash: content hash of the street net the scenario was made on."""
+
+    seed: int
+    size_m: float = 2000.0
+    style: str = "mixed"
+    net_hash: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"city-{self.style}-{self.size_m:g}m-{self.seed}"
+
+
+Place = City
+
+
+class Barrier(msgspec.Struct, frozen=True, kw_only=True):
+    """A fence across a way. heading_rad: along the way it closes; length_m: across it.
+
+    strip, end: the port of the walking graph that it closes.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    strip: str
+    end: Literal[0, 1]
+    thickness_m: float = 0.12
+    height_m: float = 1.0
+
+
+class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True):
+    """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
+
+    id: str
+    enter_s_m: float
+    leave_s_m: float
+    signalised: bool
+
+
+class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """The street life around the robot: persons and vehicles kept within radius_m of it."""
+
+    persons: int = 50
+    radius_m: float = 80.0
+    vehicles: int = 20
+
+    def __post_init__(self) -> None:
+        if self.persons < 0 or self.vehicles < 0:
+            raise SpecError(f"persons and vehicles cannot be negative: {self.persons}, {self.vehicles}")
+        if not 20.0 <= self.radius_m <= 500.0:
+            raise SpecError(f"crowd radius_m must be in [20, 500], not {self.radius_m}")
+
+
+class Scenario(msgspec.Struct, frozen=True, kw_only=True):
+    """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
+
+    id: str
+    suite: str
+    place: Place
+    seed: int
+    start: tuple[float, float, float]
+    goal: tuple[float, float]
+    route: tuple[tuple[float, float], ...]
+    crossings: tuple[RouteCrossing, ...] = ()
+    barriers: tuple[Barrier, ...] = ()
+    events: tuple[Event, ...] = ()
+    crowd: CrowdSpec = CrowdSpec()
+    robot: str = "courier"
+    goal_radius_m: float = 1.0
+    time_limit_s: float = 300.0
+    ends_on_failure: bool = False
+    schema: int = SCHEMA
+
+    def __post_init__(self) -> None:
+        if self.schema != SCHEMA:
+            raise SpecError(f"scenario '{self.id}' has schema {self.schema}; this version reads {SCHEMA}")
+        if len(self.route) < 2:
+            raise SpecError(f"scenario '{self.id}': route needs two points or more")
+        for field, (x, y), end in (("start", self.start[:2], self.route[0]), ("goal", self.goal, self.route[-1])):
+            if abs(x - end[0]) + abs(y - end[1]) > 1e-6:
+                raise SpecError(f"scenario '{self.id}': {field} {(x, y)} is not the route's end {end}")
+        if not self.goal_radius_m > 0 or not self.time_limit_s > 0:
+            raise SpecError(f"scenario '{self.id}': goal_radius_m and time_limit_s must be positive")
+        if len({event.id for event in self.events}) != len(self.events):
+            raise SpecError(f"scenario '{self.id}': two events share an id")
+
+    @property
+    def start_pose(self) -> Pose:
+        return Pose(*self.start)
+
+    @property
+    def route_line(self) -> Polyline:
+        return Polyline(self.route)
+
+
+class Suite(msgspec.Struct, frozen=True, kw_only=True):
+    """A named, versioned list of scenarios."""
+
+    name: str
+    version: str
+    scenarios: tuple[Scenario, ...]
+    description: str = ""
+
+    def __post_init__(self) -> None:
+        ids = [scenario.id for scenario in self.scenarios]
+        twice = sorted({i for i in ids if ids.count(i) > 1})
+        if twice:
+            raise SpecError(f"suite '{self.name}' lists scenarios twice: {', '.join(twice)}")
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of the suite's canonical JSON, 16 hex digits."""
+        return content_hash(self)
+
+
+def content_hash(spec: msgspec.Struct) -> str:
+    """SHA-256 of a spec's canonical JSON, 16 hex digits."""
+    return hashlib.sha256(msgspec.json.encode(spec, order="deterministic")).hexdigest()[:16]
+
+
+def read_suite(path: Path) -> Suite:
+    """The suite in a JSON file. Raises SpecError naming the file and the field."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=Suite)
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, SpecError) as error:
+        raise SpecError(f"{path}: {error}") from error
+
+
+def write_suite(suite: Suite, path: Path) -> None:
+    """Write a suite as readable JSON: one scenario a line."""
+    head = msgspec.json.encode({"name": suite.name, "version": suite.version, "description": suite.description})
+    rows = b",\n".join(msgspec.json.encode(s, order="deterministic") for s in suite.scenarios)
+    path.write_bytes(head[:-1] + b',"scenarios":[\n' + rows + b"\n]}\n")
