@@ -1,0 +1,12 @@
+"""Policies that ship with the project, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from cosim.policies.baselines import Stop, Straight
+from cosim.policies.route import Route
+from cosim.ports import Policy
+
+POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType({"stop": Stop, "straight": Straight, "route": Route})

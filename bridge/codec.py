@@ -1,0 +1,26 @@
+"""MessagePack for the messages of the bridge: typed, refused when malformed, never a pickle. Pure."""
+
+from __future__ import annotations
+
+from typing import TypeVar
+
+import msgspec
+
+from cosim.errors import EngineError
+
+T = TypeVar("T", bound=msgspec.Struct)
+
+_encoder = msgspec.msgpack.Encoder()
+
+
+def encode(message: msgspec.Struct) -> bytes:
+    """A message as MessagePack, fields by name."""
+    return _encoder.encode(message)
+
+
+def decode(payload: bytes, kind: type[T]) -> T:
+    """The message of type `kind` in `payload`. Raises EngineError when it is anything else."""
+    try:
+        return msgspec.msgpack.decode(payload, type=kind)
+    except (msgspec.DecodeError, RecursionError, ValueError) as error:
+        raise EngineError(f"not a {kind.__name__} message: {error}") from error

@@ -1,0 +1,21 @@
+"""Key expressions of the bridge, and the names that may stand in them."""
+
+from __future__ import annotations
+
+import re
+
+from cosim.errors import SpecError
+
+_NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
+
+
+def name(value: str) -> str:
+    """`value` if it may be one chunk of a key. Raises SpecError otherwise."""
+    if not _NAME.fullmatch(value):
+        raise SpecError(f"'{value}' cannot name a run or environment: use 1 to 64 of A-Z a-z 0-9 _ -")
+    return value
+
+
+def director(run: str, env: str) -> str:
+    """Where the simulator of one environment asks for the event pedestrians of a tick."""
+    return f"cosim/{name(run)}/env/{name(env)}/director"

@@ -1,0 +1,117 @@
+"""Zenoh sessions: the one place that imports zenoh.
+
+Queries and replies only, over one explicit endpoint: no scouting, no shared memory. A handler that raises answers
+with its error instead of silence.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from types import TracebackType
+from typing import Self
+
+import zenoh
+
+from cosim.errors import EngineError
+
+Handler = Callable[[bytes], bytes]
+
+_FIRST_RETRY_S = 0.005
+_LONGEST_RETRY_S = 0.2
+
+
+def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
+    settings: dict[str, object] = {
+        "mode": mode,
+        "listen/endpoints": list(listen),
+        "connect/endpoints": list(connect),
+        "scouting/multicast/enabled": False,
+        "scouting/delay": 0,
+        "connect/timeout_ms": 2000 if mode == "client" else 0,
+        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
+        "transport/link/tx/lease": 2000,
+        "transport/shared_memory/enabled": False,
+        "transport/link/rx/max_message_size": 16 << 20,
+    }
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return config
+
+
+class Session:
+    """An open Zenoh session. Use as a context manager: a session left open keeps the process alive."""
+
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
+        self._queryables: list[zenoh.Queryable[None]] = []
+
+    @classmethod
+    def hub(cls, listen: str) -> Session:
+        """The centre of a star: listens at an endpoint such as `unixsock-stream//tmp/a.sock`."""
+        return cls(_open(_config("router", [listen], []), f"cannot listen at {listen}"))
+
+    @classmethod
+    def client(cls, connect: str) -> Session:
+        """A session that connects to a hub; it opens no port of its own."""
+        return cls(_open(_config("client", [], [connect]), f"no hub answers at {connect}"))
+
+    def serve(self, key: str, handler: Handler) -> None:
+        """Answer queries on `key` with `handler(payload)`; its exceptions become error replies."""
+
+        def answer(query: zenoh.Query) -> None:
+            with query:
+                if str(query.key_expr) != key:
+                    query.reply_err(f"ask for exactly '{key}', not '{query.key_expr}'".encode())
+                    return
+                payload = query.payload.to_bytes() if query.payload is not None else b""
+                try:
+                    query.reply(key, handler(payload))
+                except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
+                    query.reply_err(f"{type(error).__name__}: {error}".encode())
+
+        self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
+
+    def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        """The reply to one query. Asks again while nobody answers, until `timeout_s` is over.
+
+        Raises TimeoutError when nobody answered, EngineError when the other side answered with an error.
+        """
+        deadline = time.monotonic() + timeout_s
+        pause_s = _FIRST_RETRY_S
+        while (left_s := deadline - time.monotonic()) > 0:
+            for reply in self._session.get(key, payload=payload, timeout=left_s):
+                if reply.ok is not None:
+                    return bytes(reply.ok.payload.to_bytes())
+                message = reply.err.payload.to_string() if reply.err is not None else ""
+                if message != "Timeout":
+                    raise EngineError(f"'{key}' answered: {message}")
+            time.sleep(min(pause_s, max(deadline - time.monotonic(), 0.0)))
+            pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
+        raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")
+
+    def close(self) -> None:
+        """Close the session; closing twice is fine."""
+        with suppress(zenoh.ZError):
+            for queryable in self._queryables:
+                queryable.undeclare()
+            self._queryables.clear()
+            self._session.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _open(config: zenoh.Config, failure: str) -> zenoh.Session:
+    try:
+        return zenoh.open(config)
+    except zenoh.ZError as error:
+        raise EngineError(f"Zenoh: {failure} ({error})") from error

@@ -1,0 +1,125 @@
+"""The one control loop: a generator of Steps. No scoring, no recording, no drawing in it.
+
+One tick (0.05 s), robot and street as they are at its start:
+
+    1 observe   the camera draws and the policy is asked, on the ticks of its own rate; else its command is held
+    2 direct    the director answers with the event pedestrians of this tick
+    3 crowd     one step on, with the robot and the event pedestrians where they are now
+    4 physics   ten substeps with the command; people and vehicles move evenly to their new places
+    5 yield     a Step; whoever drives the generator may send a Reset, obeyed before the next tick
+
+The crowd of a step has seen the robot one tick late, always; the robot's camera shows the street of its own tick.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Generator
+from dataclasses import dataclass
+
+from cosim.clock import Clock
+from cosim.control import Limits, command_of
+from cosim.errors import PolicyError
+from cosim.events import EventQuery, EventState
+from cosim.geometry import Polyline, Pose
+from cosim.ports import Camera, Crowd, Director, Observation, Policy, Privileged, World
+from cosim.scenario import Scenario
+from cosim.state import STILL, Command, Frame, RobotState
+from cosim.step import Reset, Step
+
+ROUTE_WINDOW_M = 10.0
+"""The robot's place on the route is looked for this far before and behind the last one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Parts:
+    """The engines of an episode, behind their ports."""
+
+    world: World
+    crowd: Crowd
+    director: Director
+    policy: Policy
+    camera: Camera | None
+    limits: Limits
+
+
+def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Reset | None, None]:
+    """Run a scenario, one Step a tick, for ever. Send a Reset to put the robot elsewhere, None to go on."""
+    route = scenario.route_line
+    crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
+    robot, street = parts.world.place(scenario.start_pose), parts.crowd.street
+    command, states, route_s_m = STILL, (), 0.0
+    parts.policy.reset(scenario.id, scenario.seed)
+
+    for tick in itertools.count():
+        frame = None
+        if clock.acts(tick):
+            frame = parts.camera.render(robot, street) if parts.camera is not None else None
+            known = Privileged(
+                robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings
+            )
+            command = ask(parts.policy, observe(tick, clock, robot, frame, known), parts.limits)
+        reply = parts.director.react(query(scenario, clock, tick, robot, route_s_m, states))
+        street_after = parts.crowd.step(robot, reply)
+        motion = parts.world.step(command, street, street_after, clock.substeps)
+        route_s_after_m = place_on_route(route, motion.robot.pose, route_s_m)
+
+        reset = yield Step(
+            tick, robot, street, route_s_m, frame, command, reply, motion, street_after, route_s_after_m
+        )
+
+        robot, street, states, route_s_m = motion.robot, street_after, reply.states, route_s_after_m
+        if reset is not None:
+            robot, route_s_m, command = parts.world.place(reset.pose), reset.route_s_m, STILL
+
+
+def observe(
+    tick: int, clock: Clock, robot: RobotState, frame: Frame | None, known: Privileged
+) -> Observation:
+    """What the policy is given; `known` is taken away by `ask` from a policy that does not declare it."""
+    rgb = frame.rgb if frame is not None else None
+    return Observation(tick, clock.time_s(tick), rgb, robot.v_mps, robot.w_radps, known)
+
+
+def ask(policy: Policy, observation: Observation, limits: Limits) -> Command:
+    """The policy's command. Raises PolicyError for whatever goes wrong inside the policy."""
+    manifest = policy.manifest
+    if not manifest.privileged:
+        observation = Observation(
+            observation.tick, observation.time_s, observation.rgb, observation.v_mps, observation.w_radps
+        )
+    try:
+        answer = policy.act(observation)
+    except Exception as error:
+        raise PolicyError(f"policy '{manifest.name}' raised {type(error).__name__}: {error}") from error
+    return command_of(answer, waypoint_dt_s=manifest.waypoint_dt_s, limits=limits, who=manifest.name)
+
+
+def query(
+    scenario: Scenario,
+    clock: Clock,
+    tick: int,
+    robot: RobotState,
+    route_s_m: float,
+    states: tuple[EventState, ...],
+) -> EventQuery:
+    """The question to the director at a tick."""
+    return EventQuery(
+        episode=scenario.id,
+        tick=tick,
+        tick_ms=clock.tick_ms,
+        robot_x_m=robot.pose.x_m,
+        robot_y_m=robot.pose.y_m,
+        robot_heading_rad=robot.pose.heading_rad,
+        robot_v_mps=robot.v_mps,
+        robot_w_radps=robot.w_radps,
+        route_s_m=route_s_m,
+        events=scenario.events,
+        states=states,
+    )
+
+
+def place_on_route(route: Polyline, pose: Pose, last_s_m: float) -> float:
+    """Arc length of the robot on the route, searched near the last one."""
+    s_m, _ = route.project(pose.x_m, pose.y_m, (last_s_m - ROUTE_WINDOW_M, last_s_m + ROUTE_WINDOW_M))
+    return s_m
