@@ -97,9 +97,9 @@ class Session:
         """Close the session; closing twice is fine."""
         with suppress(zenoh.ZError):
             for queryable in self._queryables:
-                queryable.undeclare()
+                queryable.undeclare()  # type: ignore[no-untyped-call]
             self._queryables.clear()
-            self._session.close()
+            self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:
         return self

@@ -104,7 +104,7 @@ class Polyline:
 
     def resampled(self, step_m: float) -> Polyline:
         """The same line with a point about every `step_m` metres; the ends stay."""
-        count = max(int(round(self.length_m / step_m)), 1)
+        count = max(round(self.length_m / step_m), 1)
         s = np.linspace(0.0, self.length_m, count + 1)
         xy = np.column_stack([np.interp(s, self.s_m, self.points[:, 0]), np.interp(s, self.s_m, self.points[:, 1])])
         return Polyline(xy)

@@ -17,6 +17,8 @@ import itertools
 from collections.abc import Generator
 from dataclasses import dataclass
 
+from shapely.geometry import MultiPolygon, Polygon
+
 from cosim.clock import Clock
 from cosim.control import Limits, command_of
 from cosim.errors import PolicyError
@@ -33,7 +35,7 @@ ROUTE_WINDOW_M = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Parts:
-    """The engines of an episode, behind their ports."""
+    """The engines of an episode, behind their ports. free: see `cosim.ports.Privileged`."""
 
     world: World
     crowd: Crowd
@@ -41,6 +43,7 @@ class Parts:
     policy: Policy
     camera: Camera | None
     limits: Limits
+    free: Polygon | MultiPolygon
 
 
 def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Reset | None, None]:
@@ -48,7 +51,8 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
     route = scenario.route_line
     crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
     robot, street = parts.world.place(scenario.start_pose), parts.crowd.street
-    command, states, route_s_m = STILL, (), 0.0
+    command, route_s_m = STILL, 0.0
+    states: tuple[EventState, ...] = ()
     parts.policy.reset(scenario.id, scenario.seed)
 
     for tick in itertools.count():
@@ -56,7 +60,7 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
         if clock.acts(tick):
             frame = parts.camera.render(robot, street) if parts.camera is not None else None
             known = Privileged(
-                robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings
+                robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings, parts.free
             )
             command = ask(parts.policy, observe(tick, clock, robot, frame, known), parts.limits)
         reply = parts.director.react(query(scenario, clock, tick, robot, route_s_m, states))
@@ -64,18 +68,14 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
         motion = parts.world.step(command, street, street_after, clock.substeps)
         route_s_after_m = place_on_route(route, motion.robot.pose, route_s_m)
 
-        reset = yield Step(
-            tick, robot, street, route_s_m, frame, command, reply, motion, street_after, route_s_after_m
-        )
+        reset = yield Step(tick, robot, street, route_s_m, frame, command, reply, motion, street_after, route_s_after_m)
 
         robot, street, states, route_s_m = motion.robot, street_after, reply.states, route_s_after_m
         if reset is not None:
             robot, route_s_m, command = parts.world.place(reset.pose), reset.route_s_m, STILL
 
 
-def observe(
-    tick: int, clock: Clock, robot: RobotState, frame: Frame | None, known: Privileged
-) -> Observation:
+def observe(tick: int, clock: Clock, robot: RobotState, frame: Frame | None, known: Privileged) -> Observation:
     """What the policy is given; `known` is taken away by `ask` from a policy that does not declare it."""
     rgb = frame.rgb if frame is not None else None
     return Observation(tick, clock.time_s(tick), rgb, robot.v_mps, robot.w_radps, known)

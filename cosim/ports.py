@@ -8,6 +8,7 @@ from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.events import EventQuery, EventReply
 from cosim.geometry import Floats, Polyline, Pose
@@ -30,8 +31,9 @@ class CameraSpec:
 class Privileged:
     """What the simulator knows and a camera does not; given only to policies that declare it.
 
-    route_s_m: the robot's arc length on the route. stops_m: for each crossing of the route its (id, enter, leave)
-    arc lengths.
+    route_s_m: the robot's arc length on the route. crossings: for each crossing of the route its id and the arc
+    lengths at which the route enters and leaves it. free: where the base centre may be with half the robot's width
+    to spare: the walkable area minus barriers, eroded.
     """
 
     robot: RobotState
@@ -41,6 +43,7 @@ class Privileged:
     vehicles: Vehicles
     signals: Mapping[str, Signal]
     crossings: tuple[tuple[str, float, float], ...]
+    free: Polygon | MultiPolygon
 
 
 @dataclass(frozen=True, slots=True)

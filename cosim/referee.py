@@ -64,7 +64,7 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the referee says of one Step. touched: contact events that began, failures or not."""
+    """What the referee says of one Step. red_light_entry: the crossing that was entered at red, if one was."""
 
     failure: Failure | None = None
     reset: Reset | None = None

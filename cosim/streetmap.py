@@ -134,7 +134,7 @@ class StreetMap:
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
         """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there are none."""
-        polygons = [p.polygon for kind in ("strip", "corner") for p in self.near(kind, area)]  # type: ignore[arg-type]
+        polygons = [piece.polygon for piece in (*self.near("strip", area), *self.near("corner", area))]
         if not polygons:
             raise MapError(f"nothing walkable near {shapely.centroid(area).wkt} on map '{self.name}'")
         return union_closed(polygons)
@@ -165,13 +165,13 @@ class StreetMap:
 
     def _tree(self, kind: str) -> tuple[shapely.STRtree, tuple[Piece, ...]]:
         if kind not in self._trees:
-            mapping: Mapping[str, Piece] = {
-                "strip": self.strips,
-                "corner": self.corners,
-                "lane": self.lanes,
-                "junction": self.junctions,
-            }[kind]
-            pieces = tuple(mapping.values())
+            of_kind: dict[str, tuple[Piece, ...]] = {
+                "strip": tuple(self.strips.values()),
+                "corner": tuple(self.corners.values()),
+                "lane": tuple(self.lanes.values()),
+                "junction": tuple(self.junctions.values()),
+            }
+            pieces = of_kind[kind]
             self._trees[kind] = (shapely.STRtree([p.polygon for p in pieces]), pieces)
         return self._trees[kind]
 
@@ -198,5 +198,5 @@ class WalkableArea:
         """Distance of (N, 2) points to the edge of the area in metres, positive inside."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         inside: NDArray[np.bool_] = shapely.contains_xy(self.polygon, xy[:, 0], xy[:, 1])
-        gap: Floats = shapely.distance(shapely.points(xy), self._edge)
+        gap = np.asarray(shapely.distance(shapely.points(xy), self._edge), dtype=float)
         return np.where(inside, gap, -gap)

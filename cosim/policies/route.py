@@ -1,7 +1,8 @@
 """`route`: the privileged baseline. Follows the reference route, waits at red, yields to people and cars.
 
-Steering is proportional-derivative on the bearing of a point ahead on the route; the lateral offset of that point
-is chosen among a few so that nobody's predicted path comes too near; the speed is what the nearest danger allows.
+A few lanes beside the route are compared: on each, how fast may one drive so that no one's predicted path (constant
+velocity) comes nearer than a clearance? The best lane is followed with a PD controller on the bearing of a point
+ahead; signals and gaps in traffic limit the speed before crossings.
 """
 
 from __future__ import annotations
@@ -9,24 +10,35 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import shapely
 
-from cosim.geometry import Floats, wrap_angle
+from cosim.geometry import Floats, Polyline, wrap_angle
 from cosim.ports import Manifest, Observation, Privileged
-from cosim.state import PERSON_RADIUS_M, STILL, Command
+from cosim.state import PERSON_RADIUS_M, Command
 
-CRUISE_MPS = 1.4
-LOOK_AHEAD_M = 1.8
-GAIN_P_PER_S = 1.6
-GAIN_D = 0.15
-MAX_W_RADPS = 0.65
-DECELERATION_MPS2 = 1.0
-STOP_BEFORE_M = 1.0
-HALF_LENGTH_M = 0.36
-HALF_WIDTH_M = 0.29
-OFFSETS_M = (0.0, 0.35, -0.35, 0.7, -0.7, 1.0, -1.0)
-CLEAR_M = 0.25
-HORIZON_S = 3.0
-CARS_SEEN_M = 40.0
+CRUISE_MPS = 1.5
+SPEEDS_MPS = np.array([1.5, 1.1, 0.7, 0.35])
+OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
+AHEAD_M = np.linspace(0.3, 4.8, 16)
+SHIFT_M_PER_M = 0.45
+"""Sideways metres per metre driven, at most, when changing lanes."""
+
+LOOK_AHEAD_M = 1.4
+GAIN_P_PER_S = 1.5
+GAIN_D = 0.12
+W_RADPS = 0.65
+BRAKE_MPS2 = 1.2
+CAR_BRAKE_MPS2 = 3.0
+STOP_SHORT_M = 0.9
+"""Distance of the base centre from the edge of a crossing that it waits at."""
+
+HALF_LENGTH_M = 0.35
+BODY_RADIUS_M = 0.33
+"""The body as two disks, fore and aft."""
+
+CLEARANCE_M = 0.25
+PATIENCE_S = 3.0
+SEEN_M = 9.0
 
 
 class Route:
@@ -35,15 +47,154 @@ class Route:
     manifest = Manifest("route", version="1", rate_hz=10.0, privileged=True)
 
     def __init__(self) -> None:
-        self._offset_m = 0.0
-        self._bearing_rad = 0.0
+        self.reset("", 0)
 
     def reset(self, scenario_id: str, seed: int) -> None:
         self._offset_m = 0.0
         self._bearing_rad = 0.0
+        self._stopped_s = 0.0
+        self._last_time_s = 0.0
 
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
         if known is None:
             raise ValueError("the route policy needs privileged observations")
-        return STILL
+        dt_s = max(observation.time_s - self._last_time_s, 1e-3)
+        self._last_time_s = observation.time_s
+
+        limit_mps = min(crossing_limit(known), CRUISE_MPS)
+        held = limit_mps < 0.1
+        self._stopped_s = 0.0 if observation.v_mps > 0.1 or held else self._stopped_s + dt_s
+        clearance_m = CLEARANCE_M if self._stopped_s < PATIENCE_S else 0.05
+        self._offset_m, free_mps = best_lane(known, self._offset_m, clearance_m)
+
+        bearing_rad = bearing_to(known, self._offset_m)
+        rate_radps = (bearing_rad - self._bearing_rad) / dt_s
+        self._bearing_rad = bearing_rad
+        w_radps = GAIN_P_PER_S * bearing_rad + GAIN_D * max(-2.0, min(2.0, rate_radps))
+        turning_mps = 0.0 if abs(bearing_rad) > 1.2 else CRUISE_MPS * (1.0 - abs(bearing_rad) / 1.2) + 0.05
+        return Command(min(limit_mps, free_mps, turning_mps), max(-W_RADPS, min(W_RADPS, w_radps)))
+
+
+def bearing_to(known: Privileged, offset_m: float) -> float:
+    """Bearing, in the robot's frame, of the point LOOK_AHEAD_M ahead on the lane at `offset_m` (left positive)."""
+    x, y, heading = known.robot.pose
+    look_m = LOOK_AHEAD_M if known.route_s_m + LOOK_AHEAD_M < known.route.length_m else 0.8
+    ahead = known.route.at(min(known.route_s_m + look_m, known.route.length_m))
+    target_x = ahead.x_m - offset_m * math.sin(ahead.heading_rad)
+    target_y = ahead.y_m + offset_m * math.cos(ahead.heading_rad)
+    return wrap_angle(math.atan2(target_y - y, target_x - x) - heading)
+
+
+def crossing_limit(known: Privileged) -> float:
+    """Speed in m/s at which the robot can still stop before the next crossing that it must not enter now."""
+    for crossing_id, enter_s_m, leave_s_m in known.crossings:
+        before_m = enter_s_m - known.route_s_m
+        if not 0.0 < before_m < 8.0:
+            continue
+        needs_s = (before_m + leave_s_m - enter_s_m + HALF_LENGTH_M) / 1.1 + 0.5
+        signal = known.signals.get(crossing_id)
+        if signal is not None:
+            may_enter = signal.walk and (signal.changes_in_s is None or signal.changes_in_s > needs_s)
+        else:
+            may_enter = not car_coming(known, enter_s_m, leave_s_m)
+        if not may_enter and before_m > HALF_LENGTH_M:
+            room_m = before_m - STOP_SHORT_M
+            return math.sqrt(2.0 * BRAKE_MPS2 * room_m) if room_m > 0.05 else 0.0
+    return math.inf
+
+
+def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
+    """Whether a car will reach the crossing soon and could not stop for somebody on it."""
+    vehicles = known.vehicles
+    if not len(vehicles):
+        return False
+    middle = known.route.at((enter_s_m + leave_s_m) / 2)
+    to_crossing = middle.xy - vehicles.xy
+    heading = np.column_stack([np.cos(vehicles.heading), np.sin(vehicles.heading)])
+    along_m = (to_crossing * heading).sum(axis=1) - vehicles.size[:, 0] / 2
+    aside_m = np.abs(to_crossing[:, 0] * heading[:, 1] - to_crossing[:, 1] * heading[:, 0])
+    near = (along_m > -vehicles.size[:, 0]) & (along_m < 40.0) & (aside_m < (leave_s_m - enter_s_m) / 2 + 2.0)
+    cannot_stop = along_m - 3.0 < vehicles.speed**2 / (2.0 * CAR_BRAKE_MPS2)
+    return bool((near & cannot_stop & (vehicles.speed > 0.5)).any())
+
+
+def best_lane(known: Privileged, current_m: float, clearance_m: float) -> tuple[float, float]:
+    """(offset, speed): the lane beside the route worth taking and the speed that is safe on it.
+
+    Every lane is a path of AHEAD_M points that shifts from where the robot is to the lane. A speed is safe when no
+    predicted disk comes nearer than `clearance_m` to the body while driving it for the horizon.
+    """
+    centres, velocities, radii = obstacles(known)
+    if not len(centres):
+        return 0.0, CRUISE_MPS
+    paths, headings = lane_paths(known.route, known.route_s_m, lateral_of(known))
+    speeds = safe_speeds(paths, headings, centres, velocities, radii, clearance_m)
+    inside = shapely.contains_xy(known.free, paths[..., 0], paths[..., 1])
+    inside[0] = True
+    speeds = np.where(inside.all(axis=1), speeds, -1.0)
+    score = speeds - 0.25 * np.abs(OFFSETS_M) - 0.3 * np.abs(OFFSETS_M - current_m)
+    best = int(np.argmax(np.where(speeds >= 0.0, score, -np.inf)))
+    if speeds[best] <= 0.0:
+        return current_m, 0.0
+    return float(OFFSETS_M[best]), float(speeds[best])
+
+
+def lateral_of(known: Privileged) -> float:
+    """Where the robot is beside its route, left positive, in metres."""
+    near = (known.route_s_m - 3.0, known.route_s_m + 3.0)
+    return known.route.project(known.robot.pose.x_m, known.robot.pose.y_m, near)[1]
+
+
+def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
+    """Disks to keep away from: centres (N, 2) m, velocities (N, 2) m/s, radii (N,) m.
+
+    People near and not behind; on a crossing vehicles too, three disks each.
+    """
+    pose = known.robot.pose
+    groups = [(known.people.xy, known.people.heading, known.people.speed, PERSON_RADIUS_M)]
+    if any(enter - 3.0 < known.route_s_m < leave for _, enter, leave in known.crossings):
+        cars = known.vehicles
+        along = np.column_stack([np.cos(cars.heading), np.sin(cars.heading)])
+        for part in (-0.35, 0.0, 0.35):
+            xy = cars.xy + part * cars.size[:, :1] * along
+            groups.append((xy, cars.heading, cars.speed, 1.1))
+    forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
+    centres, velocities, radii = [], [], []
+    for xy, heading, speed, radius in groups:
+        offset = xy - pose.xy
+        near = (np.hypot(offset[:, 0], offset[:, 1]) < SEEN_M) & (offset @ forward > -0.2)
+        centres.append(xy[near])
+        velocities.append((speed * np.array([np.cos(heading), np.sin(heading)])).T[near])
+        radii.append(np.full(int(near.sum()), radius))
+    return np.concatenate(centres), np.concatenate(velocities), np.concatenate(radii)
+
+
+def lane_paths(route: Polyline, s_m: float, lateral_m: float) -> tuple[Floats, Floats]:
+    """The lanes as points (offsets, ahead, 2) in metres and headings (ahead,) of the route there."""
+    along = np.minimum(s_m + AHEAD_M, route.length_m)
+    x, y = np.interp(along, route.s_m, route.points[:, 0]), np.interp(along, route.s_m, route.points[:, 1])
+    x0, y0 = (
+        np.interp(along - 0.2, route.s_m, route.points[:, 0]),
+        np.interp(along - 0.2, route.s_m, route.points[:, 1]),
+    )
+    headings = np.arctan2(y - y0, x - x0)
+    shift = np.clip(OFFSETS_M[:, None] - lateral_m, -SHIFT_M_PER_M * AHEAD_M, SHIFT_M_PER_M * AHEAD_M)
+    lateral = lateral_m + shift
+    return np.stack([x - lateral * np.sin(headings), y + lateral * np.cos(headings)], axis=-1), headings
+
+
+def safe_speeds(
+    paths: Floats, headings: Floats, centres: Floats, velocities: Floats, radii: Floats, clearance_m: float
+) -> Floats:
+    """The highest of SPEEDS_MPS that is safe on each lane, (offsets,) m/s; 0 where none is."""
+    times = AHEAD_M / SPEEDS_MPS[:, None]
+    people = centres + velocities * times[..., None, None]
+    nose = 0.18 * np.column_stack([np.cos(headings), np.sin(headings)])
+    gap = np.full((len(paths), len(SPEEDS_MPS)), np.inf)
+    for body in (paths + nose, paths - nose):
+        away = body[:, None, :, None, :] - people[None]
+        gaps = np.hypot(away[..., 0], away[..., 1]) - radii - BODY_RADIUS_M
+        gap = np.minimum(gap, gaps.min(axis=(2, 3)))
+    safe = gap >= clearance_m
+    return np.where(safe.any(axis=1), SPEEDS_MPS[np.argmax(safe, axis=1)], 0.0)

@@ -1,0 +1,201 @@
+"""One episode on disk: `record.json` (what came out) and `trajectory.npz` (what happened, tick by tick).
+
+Everything in a record but its `clock` part is a function of scenario, policy and versions: two runs give the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import RunError
+from cosim.geometry import Floats
+from cosim.referee import Failure, Verdict
+from cosim.step import Step
+
+SCHEMA = 1
+
+Status = Literal["done", "invalid", "crashed"]
+
+
+@dataclass(frozen=True)
+class Log:
+    """An episode tick by tick, T rows; values at the end of each tick.
+
+    pose (T, 3) x m, y m, heading rad; speed (T, 2) v m/s, w rad/s; command (T, 2) likewise; route_s_m (T,);
+    travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
+    reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
+    people_tick (P,), people_xy (P, 2), people_event (P,) bool: persons within 30 m, once a second, for pictures.
+    """
+
+    tick_s: float
+    pose: Floats
+    speed: Floats
+    command: Floats
+    route_s_m: Floats
+    travelled_m: Floats
+    person_m: Floats
+    reset_s_m: Floats
+    waits_at_red: NDArray[np.bool_]
+    people_tick: NDArray[np.int64]
+    people_xy: Floats
+    people_event: NDArray[np.bool_]
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def save(self, path: Path) -> None:
+        """Write as .npz, whole or not at all."""
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            np.savez_compressed(file, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Log:
+        """Read a saved log. Raises RunError naming the file."""
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                values = {name: arrays[name] for name in (f.name for f in fields(cls))}
+        except (OSError, KeyError, ValueError) as error:
+            raise RunError(f"{path}: not a trajectory: {error}") from error
+        values["tick_s"] = float(values["tick_s"])
+        return cls(**values)
+
+
+class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger never fired."""
+
+    id: str
+    kind: str
+    passed: bool
+    triggered_at_s: float | None = None
+    trigger_distance_m: float | None = None
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible."""
+
+    scenario: str
+    scenario_hash: str
+    suite: str
+    suite_hash: str
+    seed: int
+    policy: str
+    policy_version: str
+    goal_protocol: str
+    renderer: str
+    versions: dict[str, str]
+    status: Status
+    reason: str = ""
+    ended: Literal["goal", "timeout", "failure"] | None = None
+    ticks: int = 0
+    state_hash: str = ""
+    measures: dict[str, float | None] = {}
+    failures: tuple[Failure, ...] = ()
+    events: tuple[TriggeredEvent, ...] = ()
+    schema: int = SCHEMA
+    clock: dict[str, float] = {}
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            file.write(msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Record:
+        """Read a record. Raises RunError naming the file and the field."""
+        try:
+            record = msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise RunError(f"{path}: not an episode record: {error}") from error
+        if record.schema != SCHEMA:
+            raise RunError(f"{path}: record schema {record.schema}; this version reads {SCHEMA}")
+        return record
+
+
+class StateHash:
+    """A running hash of everything simulated: robot, people, vehicles, signals, contacts, at every tick."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=16)
+
+    def add(self, step: Step) -> None:
+        robot, street = step.motion.robot, step.street_after
+        for array in (
+            np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
+            step.motion.trace,
+            street.people.xy,
+            street.people.heading,
+            street.vehicles.xy,
+            street.vehicles.heading,
+        ):
+            self._hash.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        names = [*street.people.ids, *street.vehicles.ids, *(c.other for c in step.motion.contacts)]
+        names += [f"{name}{signal.walk}" for name, signal in sorted(street.signals.items())]
+        self._hash.update("|".join(names).encode())
+
+    def hexdigest(self) -> str:
+        return self._hash.hexdigest()
+
+
+class Recorder:
+    """Collects the Steps of an episode into a Log."""
+
+    PEOPLE_EVERY_TICKS = 20
+    PEOPLE_WITHIN_M = 30.0
+
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s = tick_s
+        self._rows: list[tuple[float, ...]] = []
+        self._people: list[tuple[int, float, float, bool]] = []
+        self.hash = StateHash()
+
+    def add(self, step: Step, verdict: Verdict) -> None:
+        self.hash.add(step)
+        robot, people = step.motion.robot, step.street_after.people
+        track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
+        travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
+        away = np.hypot(*(people.xy - robot.pose.xy).T) if len(people) else np.array([np.inf])
+        reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
+        self._rows.append(
+            (*robot.pose, robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
+            + (step.route_s_after_m, travelled_m, float(away.min()), reset_s_m, float(verdict.waits_at_red))
+        )
+        if step.tick % self.PEOPLE_EVERY_TICKS == 0:
+            for i in np.flatnonzero(away[: len(people)] < self.PEOPLE_WITHIN_M):
+                x, y = people.xy[i]
+                self._people.append((step.tick, float(x), float(y), people.ids[i].startswith("e")))
+
+    def log(self) -> Log:
+        """The episode so far."""
+        rows = np.array(self._rows, dtype=float).reshape(-1, 12)
+        people = np.array(self._people, dtype=float).reshape(-1, 4)
+        return Log(
+            tick_s=self._tick_s,
+            pose=rows[:, 0:3],
+            speed=rows[:, 3:5],
+            command=rows[:, 5:7],
+            route_s_m=rows[:, 7],
+            travelled_m=rows[:, 8],
+            person_m=rows[:, 9],
+            reset_s_m=rows[:, 10],
+            waits_at_red=rows[:, 11] > 0,
+            people_tick=people[:, 0].astype(np.int64),
+            people_xy=people[:, 1:3],
+            people_event=people[:, 3] > 0,
+        )
