@@ -1,0 +1,251 @@
+"""SumoCrowd: the people, vehicles and signals around the robot, by SUMO. The only file that imports libsumo.
+
+One SUMO per process, and one step of it per tick. Persons, robot and event pedestrians share SUMO's sidewalks: the
+robot and the event pedestrians are mirrored in as proxies, so the crowd evades them one tick late.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+import libsumo
+import numpy as np
+
+from cosim.errors import EngineError
+from cosim.events import Actor, EventReply
+from cosim.geometry import heading_from_sumo
+from cosim.ports import Crowd
+from cosim.scenario import CrowdSpec
+from cosim.state import People, RobotState, Street, Vehicles
+from cosim.streetmap import Port, StreetMap
+from sumo_nets.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.lights import Signals
+from sumo_nets.proxy import Proxy, Walks
+from sumo_nets.smooth import PoseFilter
+
+TICK_MS = 50
+"""One step of SUMO."""
+
+ROLL_TICKS = 10
+"""How often persons and vehicles come and go."""
+
+WARM_UP_S = 8.0
+"""How long the vehicles drive before the first tick; persons walk at once."""
+
+SIGNAL_CLOCK_S = 3600
+"""The signals' clocks start somewhere in this span, drawn from the seed."""
+
+STANDING_MPS = 0.1
+EYE = "robot"
+Row = tuple[float, float, float, float, float]
+"""x m, y m, heading rad, speed m/s, waiting s."""
+
+tc = libsumo.constants
+SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
+
+
+class SumoCrowd(Crowd):
+    """The crowd around the robot on the street net at `net_path`, of which `street_map` was read.
+
+    closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
+    Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
+    """
+
+    _running: ClassVar[SumoCrowd | None] = None
+
+    def __init__(
+        self,
+        net_path: Path,
+        street_map: StreetMap,
+        spec: CrowdSpec,
+        seed: int,
+        closed: frozenset[Port],
+        start_xy: tuple[float, float],
+    ) -> None:
+        self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
+        self._closed, self._start_xy = closed, start_xy
+        self._street: Street | None = None
+
+    def __enter__(self) -> Self:
+        if SumoCrowd._running is not None:
+            raise EngineError(
+                "a SumoCrowd is already running in this process, and SUMO can run only once per process: "
+                "close it first, or use another process"
+            )
+        rng_sumo, rng_persons, rng_vehicles = np.random.default_rng(self._seed).spawn(3)
+        self._launch(int(rng_sumo.integers(2**31)), int(rng_sumo.integers(SIGNAL_CLOCK_S)))
+        SumoCrowd._running = self
+        try:
+            with _translated("setting up the crowd"):
+                self._populate(rng_persons, rng_vehicles)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Stop SUMO; a second call does nothing."""
+        if SumoCrowd._running is self:
+            SumoCrowd._running = None
+            self._street = None
+            libsumo.close()
+
+    @property
+    def street(self) -> Street:
+        """The street now."""
+        if self._street is None:
+            raise EngineError("this SumoCrowd is not running: use it as a context manager")
+        return self._street
+
+    def step(self, robot: RobotState, reply: EventReply) -> Street:
+        """One tick on, with the robot and the event pedestrians where they are now."""
+        tick = self.street.tick
+        with _translated(f"stepping from tick {tick}"):
+            x_m, y_m, heading_rad = robot.pose
+            libsumo.poi.setPosition(EYE, x_m, y_m)
+            if tick % ROLL_TICKS == 0:
+                persons, vehicles = self._seen
+                self._pedestrians.roll(x_m, y_m, persons, self._waits_at_red)
+                self._drivers.roll(x_m, y_m, vehicles)
+            self._robot.update(x_m, y_m, heading_rad)
+            self._mirror(reply.actors)
+            libsumo.simulationStep()
+            self._street = self._read(tick + 1, x_m, y_m, reply.actors)
+        return self._street
+
+    def _launch(self, sumo_seed: int, begin_s: int) -> None:
+        if not self._net_path.is_file():
+            raise EngineError(f"no street net at {self._net_path}")
+        with tempfile.TemporaryDirectory(prefix="cosim-sumo-") as folder:
+            log = Path(folder) / "errors.txt"
+            try:
+                libsumo.start(_arguments(self._net_path, sumo_seed, begin_s, log))
+            except SUMO_ERRORS as error:
+                said = log.read_text(errors="replace") if log.is_file() else ""
+                with suppress(*SUMO_ERRORS):
+                    libsumo.close()
+                reason = " ".join([*said.split("\n"), str(error)]).strip()
+                raise EngineError(f"SUMO cannot start on {self._net_path}: {reason}") from error
+
+    def _populate(self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator) -> None:
+        x_m, y_m = self._start_xy
+        for kind, length_m, width_m, gap_m in (("robot", 1.0, 1.0, 0.5), ("event", 0.5, 0.6, 0.25)):
+            libsumo.vehicletype.copy("DEFAULT_PEDTYPE", kind)
+            libsumo.vehicletype.setLength(kind, length_m)
+            libsumo.vehicletype.setWidth(kind, width_m)
+            libsumo.vehicletype.setMinGap(kind, gap_m)
+        self._walks = Walks(libsumo, self._map)
+        self._signals = Signals(libsumo, self._map)
+        self._pedestrians = Pedestrians(libsumo, self._map, self._spec, rng_persons, self._closed)
+        self._drivers = Drivers(libsumo, self._map, self._spec, rng_vehicles)
+        self._serial: Iterator[int] = count()
+        self._robot = Proxy(libsumo, self._walks, base="r", kind="robot", serial=self._serial)
+        self._actors: dict[str, Proxy] = {}
+        self._poses = PoseFilter(TICK_MS / 1000)
+        self._watch(x_m, y_m)
+        if self._spec.vehicles:
+            self._drivers.fill(x_m, y_m)
+            for _ in range(round(WARM_UP_S * 1000 / TICK_MS)):
+                libsumo.simulationStep()
+        self._pedestrians.fill(x_m, y_m)
+        libsumo.simulationStep()
+        self._street = self._read(0, x_m, y_m, ())
+
+    def _watch(self, x_m: float, y_m: float) -> None:
+        """One subscription each to the persons and to the vehicles around a point that follows the robot."""
+        libsumo.poi.add(EYE, x_m, y_m, (0, 0, 0, 0))
+        variables = [tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED, tc.VAR_WAITING_TIME]
+        for domain, reach_m in (
+            (tc.CMD_GET_PERSON_VARIABLE, self._spec.radius_m + LINGER_M),
+            (tc.CMD_GET_VEHICLE_VARIABLE, VEHICLE_REACH_M),
+        ):
+            libsumo.poi.subscribeContext(EYE, domain, reach_m, variables)
+
+    def _mirror(self, actors: tuple[Actor, ...]) -> None:
+        present = {actor.id for actor in actors}
+        if len(present) != len(actors) or not all(name.startswith("e") for name in present):
+            raise EngineError(f"event pedestrians need unique ids that start with 'e': {[a.id for a in actors]}")
+        for name in sorted(self._actors.keys() - present):
+            self._actors.pop(name).remove()
+        for actor in actors:
+            if actor.id not in self._actors:
+                self._actors[actor.id] = Proxy(libsumo, self._walks, base=actor.id, kind="event", serial=self._serial)
+            self._actors[actor.id].update(actor.x_m, actor.y_m, actor.heading_rad)
+
+    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
+        persons: dict[str, Row] = {}
+        vehicles: dict[str, Row] = {}
+        found: dict[str, Any] = libsumo.poi.getContextSubscriptionResults(EYE)
+        for name in sorted(found):
+            kind = vehicles if name[0] == "v" else persons if name[0] == "c" else None
+            values = found[name]
+            if kind is not None and (xy := values[tc.VAR_POSITION])[0] > -1e8:
+                heading_rad = heading_from_sumo(values[tc.VAR_ANGLE])
+                kind[name] = (*xy, heading_rad, values[tc.VAR_SPEED], values[tc.VAR_WAITING_TIME])
+        self._seen = tuple({i: Seen(v[0], v[1], v[4]) for i, v in kind.items()} for kind in (persons, vehicles))
+        return Street(tick, self._people(persons, actors), self._vehicles(vehicles), self._signals.near(x_m, y_m))
+
+    def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...]) -> People:
+        ids = tuple(persons)
+        table = np.array(list(persons.values()), dtype=float).reshape(-1, 5)
+        xy, heading, speed = self._poses.update(ids, table[:, :2], table[:, 2], table[:, 3])
+        cast = sorted(actors, key=lambda actor: actor.id)
+        return People.of(
+            (*ids, *(a.id for a in cast)),
+            np.concatenate([xy, np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)]),
+            np.concatenate([heading, [a.heading_rad for a in cast]]),
+            np.concatenate([speed, [a.speed_mps for a in cast]]),
+            (*("walk" if fast else "stand" for fast in speed > STANDING_MPS), *(a.doing for a in cast)),
+        )
+
+    def _vehicles(self, vehicles: dict[str, Row]) -> Vehicles:
+        """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""
+        table = np.array(list(vehicles.values()), dtype=float).reshape(-1, 5)
+        size = np.array([self._drivers.size_m(name) for name in vehicles], dtype=float).reshape(-1, 2)
+        heading = table[:, 2]
+        back = 0.5 * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
+        return Vehicles.of(tuple(vehicles), table[:, :2] - back, heading, table[:, 3], size)
+
+    def _waits_at_red(self, person: str) -> bool:
+        return self._signals.is_red(libsumo.person.getNextEdge(person))
+
+
+def _arguments(net_path: Path, sumo_seed: int, begin_s: int, error_log: Path) -> list[str]:
+    """SUMO's command line. Without jam times nobody squeezes through the robot; see the options' own help for more."""
+    options: dict[str, object] = {
+        "net-file": net_path,
+        "seed": sumo_seed,
+        "begin": begin_s,
+        "step-length": TICK_MS / 1000,
+        "pedestrian.model": "striping",
+        "pedestrian.striping.dawdling": 0,
+        "pedestrian.striping.walkingarea-detail": 20,
+        "pedestrian.striping.jamtime": -1,
+        "pedestrian.striping.jamtime.crossing": -1,
+        "collision.action": "warn",
+        "collision.check-junctions": "true",
+        "time-to-teleport": -1,
+        "max-depart-delay": 1,
+        "lanechange.duration": 2,
+        "no-step-log": "true",
+        "no-warnings": "true",
+        "error-log": error_log,
+    }
+    return ["sumo", *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
+
+
+@contextmanager
+def _translated(doing: str) -> Iterator[None]:
+    try:
+        yield
+    except SUMO_ERRORS as error:
+        raise EngineError(f"SUMO failed while {doing}: {error}") from error

@@ -1,0 +1,144 @@
+"""Proxies: how SUMO's persons and cars see the robot and the event pedestrians.
+
+A proxy is a SUMO person that is put where its original is before every step. SUMO sees it only on the edges of its
+own walk and around the junction where the first of them ends, so the walk is chosen by the place and made anew when
+the place changes. Other ways of moving a person (free mapping, a walk of one walking area) crash SUMO.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+import shapely
+
+from cosim.geometry import heading_to_sumo
+from cosim.streetmap import Located, StreetMap
+
+KEEP_ROUTE = 3
+"""moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""
+
+KEEP_ROUTE_ON_ROAD = 7
+"""The same with car lanes allowed: cars stop for somebody on the carriageway."""
+
+MATCH_M = 100.0
+
+
+class Walk(NamedTuple):
+    """A walk of a proxy: from `first` over `junction`, where it ends, to `second`."""
+
+    junction: str
+    first: str
+    second: str
+
+
+class Walks:
+    """Chooses a proxy's walk from where it is and where it heads."""
+
+    def __init__(self, engine: Any, street_map: StreetMap) -> None:
+        self.street_map = street_map
+        self._ends: dict[str, tuple[str, str]] = {}
+        self._into: dict[str, list[str]] = {}
+        self._at: dict[str, list[str]] = {}
+        for strip in street_map.strips.values():
+            if strip.kind == "sidewalk":
+                ends = (engine.edge.getFromJunction(strip.id), engine.edge.getToJunction(strip.id))
+                self._ends[strip.id] = ends
+                self._into.setdefault(ends[1], []).append(strip.id)
+                for junction in dict.fromkeys(ends):
+                    self._at.setdefault(junction, []).append(strip.id)
+
+    def serves(self, walk: Walk, edge: str, heading_rad: float) -> bool:
+        """Whether SUMO sees a proxy on `edge` when it has `walk`."""
+        if edge.startswith(":"):
+            return walk.junction == junction_of(edge) == self._ends[walk.first][1]
+        return walk.first == edge and walk.junction == self._ahead(edge, heading_rad)
+
+    def choose(self, edge: str, heading_rad: float) -> Walk | None:
+        """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
+        if edge.startswith(":"):
+            junction = junction_of(edge)
+            firsts = self._into.get(junction, [])
+        elif edge in self._ends:
+            junction = self._ahead(edge, heading_rad)
+            firsts = [edge]
+        else:
+            return None
+        fallback: Walk | None = None
+        for first in firsts:
+            for second in self._at.get(junction, []):
+                if second == first:
+                    continue
+                if self._ends[second] != self._ends[first][::-1]:
+                    return Walk(junction, first, second)
+                fallback = fallback or Walk(junction, first, second)
+        return fallback
+
+    def _ahead(self, edge: str, heading_rad: float) -> str:
+        line = self.street_map.strips[edge].line
+        dx, dy = line[-1] - line[0]
+        return self._ends[edge][1 if dx * np.cos(heading_rad) + dy * np.sin(heading_rad) >= 0.0 else 0]
+
+
+class Proxy:
+    """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after another."""
+
+    def __init__(self, engine: Any, walks: Walks, *, base: str, kind: str, serial: Iterator[int]) -> None:
+        self._engine = engine
+        self._walks = walks
+        self._base, self._kind, self._serial = base, kind, serial
+        self._name: str | None = None
+        self._walk: Walk | None = None
+        self._point: tuple[float, float] | None = None
+        self._place = Located("off", "")
+        self._piece: shapely.Geometry | None = None
+
+    def update(self, x_m: float, y_m: float, heading_rad: float) -> None:
+        """Put it at a pose. To be called before every step of the simulation, or it walks on by itself."""
+        place = self._locate(x_m, y_m)
+        walk = self._walk
+        if place.kind == "off":
+            walk = None
+        elif walk is None or not self._walks.serves(walk, place.edge, heading_rad):
+            walk = self._walks.choose(place.edge, heading_rad)
+        if walk != self._walk or self._name is None:
+            self.remove()
+            if walk is not None:
+                self._add(walk)
+        if self._name is not None:
+            mode = KEEP_ROUTE_ON_ROAD if place.kind == "road" else KEEP_ROUTE
+            self._engine.person.moveToXY(self._name, "", x_m, y_m, heading_to_sumo(heading_rad), mode, MATCH_M)
+
+    def remove(self) -> None:
+        """Take it out of the simulation."""
+        if self._name is not None and self._name in self._engine.person.getIDList():
+            self._engine.person.remove(self._name)
+        self._name = self._walk = None
+
+    def _add(self, walk: Walk) -> None:
+        person = self._engine.person
+        self._name, self._walk = f"{self._base}.{next(self._serial)}", walk
+        lengths = [self._engine.lane.getLength(f"{edge}_0") for edge in (walk.first, walk.second)]
+        person.add(self._name, walk.first, lengths[0] / 2, typeID=self._kind)
+        person.appendWalkingStage(self._name, [walk.first, walk.second], lengths[1] / 2)
+
+    def _locate(self, x_m: float, y_m: float) -> Located:
+        """The map's `locate`, asked again only when the body has left the walkable piece where it was."""
+        if self._point == (x_m, y_m):
+            return self._place
+        self._point = (x_m, y_m)
+        if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
+            street_map = self._walks.street_map
+            self._place = place = street_map.locate(x_m, y_m)
+            self._piece = None
+            if place.kind == "walk":
+                piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
+                self._piece = piece.polygon
+                shapely.prepare(self._piece)
+        return self._place
+
+
+def junction_of(internal: str) -> str:
+    """The junction of a walking area, crossing or internal edge: "a_b" of ":a_b_w0"."""
+    return internal[1:].rsplit("_", 1)[0]
