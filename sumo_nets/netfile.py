@@ -1,0 +1,390 @@
+"""Street nets on disk: netconvert, with its failures as MapError; and any .net.xml(.gz) as a StreetMap.
+
+The reader streams the file once through expat and makes all polygons in a few vectorised calls.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import re
+import subprocess
+import zlib
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+from xml.parsers import expat
+
+import numpy as np
+import shapely
+from shapely.geometry import MultiPolygon, Point, Polygon
+
+from cosim.errors import MapError
+from cosim.geometry import Floats
+from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
+
+LANE_M = 3.2
+"""SUMO's width of a lane, sidewalks included, that names none."""
+SPECK_M2 = 0.5
+SHORTEST_M = 0.1
+
+Attributes = dict[str, str]
+
+
+def netconvert(arguments: Sequence[str], output: Path, timeout_s: float = 120.0) -> Path:
+    """Run netconvert to make `output`. Raises MapError with the command and the end of its complaints."""
+    import sumo
+
+    command = [str(Path(sumo.__file__).parent / "bin" / "netconvert"), *arguments, "-o", str(output)]
+    shown = " ".join(["netconvert", *command[1:]])
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise MapError(f"netconvert did not end within {timeout_s:g} s: {shown}") from error
+    except OSError as error:
+        raise MapError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed? {shown}") from error
+    tail = "\n".join(done.stderr.strip().splitlines()[-8:])
+    if done.returncode != 0 or not output.exists():
+        raise MapError(f"netconvert failed with exit code {done.returncode}: {shown}\n{tail}")
+    # An exit code of 0 is no proof: an empty net ends in "Success" too.
+    if b"<edge " not in output.read_bytes():
+        raise MapError(f"netconvert made a net without any edge: {shown}\n{tail}")
+    return output
+
+
+def without_comments(net: bytes) -> bytes:
+    """A net's XML without comments: netconvert's hold the time, its version and the folders of the machine."""
+    return re.sub(rb"<!--.*?-->\s*", b"", net, flags=re.DOTALL)
+
+
+def net_content_hash(path: Path) -> str:
+    """SHA-256 (16 hex digits) of what a net says: comments, schema location and line ends do not count."""
+    return _hash(_load(path))
+
+
+def read_net(path: Path) -> StreetMap:
+    """The StreetMap of a .net.xml or .net.xml.gz. Raises MapError naming the file and the reason.
+
+    Nets without sidewalks or walking areas are read too: their strips or corners are empty.
+    """
+    data = _load(path)
+    raw = _parse(path, data)
+    try:
+        return _street_map(path, raw, _hash(data))
+    except (ValueError, KeyError, IndexError, shapely.errors.GEOSException) as error:
+        raise MapError(f"{path}: not a street net that can be read: {type(error).__name__}: {error}") from error
+
+
+def _load(path: Path) -> bytes:
+    try:
+        data = path.read_bytes()
+        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
+    except OSError as error:
+        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except (EOFError, zlib.error) as error:
+        raise MapError(f"{path}: broken gzip file: {error}") from error
+
+
+def _hash(data: bytes) -> str:
+    bare = re.sub(rb'\s+xsi:noNamespaceSchemaLocation="[^"]*"', b"", without_comments(data))
+    return hashlib.sha256(bare.replace(b"\r\n", b"\n").strip()).hexdigest()[:16]
+
+
+@dataclass(slots=True)
+class _Edge:
+    attributes: Attributes
+    lanes: list[Attributes] = field(default_factory=list)
+    params: Attributes = field(default_factory=dict)
+
+
+@dataclass(slots=True)
+class _Raw:
+    """The elements of a net that make a place."""
+
+    net: Attributes = field(default_factory=dict)
+    location: Attributes = field(default_factory=dict)
+    edges: list[_Edge] = field(default_factory=list)
+    junctions: list[Attributes] = field(default_factory=list)
+    links: list[Attributes] = field(default_factory=list)
+
+
+def _parse(path: Path, data: bytes) -> _Raw:
+    raw, stack = _Raw(), list[str]()
+    edges, junctions, links = raw.edges, raw.junctions, raw.links
+
+    def start(tag: str, attributes: Attributes) -> None:
+        parent = stack[-1] if stack else ""
+        stack.append(tag)
+        if tag == "request":
+            return
+        if tag == "connection":
+            # Only those to and from walking areas and crossings, which are internal edges, matter here.
+            if attributes.get("from", "").startswith(":") or attributes.get("to", "").startswith(":"):
+                links.append(attributes)
+        elif tag == "lane" and parent == "edge":
+            edges[-1].lanes.append(attributes)
+        elif tag == "edge" and parent == "net":
+            edges.append(_Edge(attributes))
+        elif tag == "param" and parent == "edge":
+            edges[-1].params[attributes.get("key", "")] = attributes.get("value", "")
+        elif tag == "junction" and parent == "net":
+            junctions.append(attributes)
+        elif tag == "location":
+            raw.location = attributes
+        elif tag == "net":
+            raw.net = attributes
+
+    def end(_tag: str) -> None:
+        stack.pop()
+
+    parser = expat.ParserCreate()
+    parser.StartElementHandler = start
+    parser.EndElementHandler = end
+    try:
+        parser.Parse(data, True)
+    except expat.ExpatError as error:
+        raise MapError(f"{path}: broken XML: {error}") from error
+    if not raw.net:
+        raise MapError(f"{path}: not a SUMO street net: it has no <net>")
+    if not edges:
+        raise MapError(f"{path}: the street net has no edges: nothing walkable here")
+    return raw
+
+
+def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
+    walk: dict[str, tuple[_Edge, Attributes, int]] = {}
+    areas: dict[str, Attributes] = {}
+    driven: list[tuple[_Edge, Attributes, Literal["road", "verge"]]] = []
+    for edge in raw.edges:
+        function = edge.attributes.get("function", "")
+        if function == "walkingarea" and edge.lanes:
+            areas[edge.attributes["id"]] = edge.lanes[0]
+            continue
+        if function == "crossing" and edge.lanes:
+            walk[edge.attributes["id"]] = (edge, edge.lanes[0], 0)
+            continue
+        footway = -1 if function == "internal" else _footway(edge)
+        for i, lane in enumerate(edge.lanes):
+            if i == footway:
+                walk[edge.attributes["id"]] = (edge, lane, i)
+            elif function != "internal" or not _only_walked(lane):
+                driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
+    left_hand = raw.net.get("lefthand") in ("true", "1")
+    lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
+    lines = _lines([lane["shape"] for lane in lanes])
+    widths = np.array([float(lane.get("width", LANE_M)) for lane in lanes])
+    bands = _bands(lines, widths)
+    corners = _corners(areas, raw.links)
+    ports, signalised = _ports(raw.links, walk, corners, lines)
+    strips: dict[str, Strip] = {}
+    for k, (name, (edge, _, index)) in enumerate(walk.items()):
+        ends = ports.get((name, 0)), ports.get((name, 1))
+        strips[name] = _strip(edge, index, left_hand, lines[k], float(widths[k]), bands[k], ends, name in signalised)
+    roads = {
+        lane["id"]: Lane(
+            id=lane["id"],
+            edge=edge.attributes["id"],
+            kind=kind,
+            line=lines[k],
+            width_m=float(widths[k]),
+            polygon=bands[k],
+            internal=edge.attributes.get("function", "") == "internal",
+        )
+        for k, (edge, lane, kind) in enumerate(driven, len(walk))
+    }
+    at: dict[str, list[Port]] = defaultdict(list)
+    for (strip, end), corner in ports.items():
+        at[corner].append(Port(strip, 1 if end else 0))
+    return StreetMap(
+        name=re.sub(r"(\.net)?\.xml(\.gz)?$", "", path.name),
+        bounds=_bounds(raw, lines),
+        strips=strips,
+        corners={c: Corner(id=c, polygon=polygon, ports=tuple(at[c])) for c, polygon in corners.items()},
+        lanes=roads,
+        junctions=_junctions(raw.junctions),
+        net_hash=net_hash,
+        left_hand=left_hand,
+    )
+
+
+def _allows(lane: Attributes, vehicle: str) -> bool:
+    if "allow" in lane:
+        return lane["allow"] == "all" or vehicle in lane["allow"].split()
+    return lane.get("disallow", "") != "all" and vehicle not in lane.get("disallow", "").split()
+
+
+def _only_walked(lane: Attributes) -> bool:
+    return _allows(lane, "pedestrian") and not _allows(lane, "passenger")
+
+
+def _footway(edge: _Edge) -> int:
+    """Index of the lane for walking, paths shared with bicycles included; -1 without one."""
+    return next((i for i, lane in enumerate(edge.lanes) if _only_walked(lane)), -1)
+
+
+def _is_verge(lane: Attributes) -> bool:
+    return lane.get("type", "") == "green_verge" or lane.get("disallow") == "all" or lane.get("allow") == ""
+
+
+def _lines(shapes: Sequence[str]) -> list[Floats]:
+    """(N, 2) metres of every shape, N >= 2 and never of zero length; elevations are dropped."""
+    flat, counts = _coordinates(shapes)
+    lines = np.split(flat, np.cumsum(counts)[:-1])
+    for i, line in enumerate(lines):
+        if len(line) < 2 or (len(line) == 2 and abs(line[1] - line[0]).sum() < 1e-3):
+            lines[i] = line[0] + np.array([[-SHORTEST_M / 2.0, 0.0], [SHORTEST_M / 2.0, 0.0]])
+        lines[i].flags.writeable = False
+    return lines
+
+
+def _coordinates(shapes: Sequence[str]) -> tuple[Floats, list[int]]:
+    """All points of all shapes, (sum of counts, 2) metres, and the count of each."""
+    points = [shape.split() for shape in shapes]
+    counts = [len(row) for row in points]
+    if not all(counts):
+        raise ValueError("a shape without points")
+    every = [point for row in points for point in row]
+    # Points with and without elevation mix, even in one shape.
+    numbers = ",".join(p if p.count(",") == 1 else ",".join(p.split(",")[:2]) for p in every).split(",")
+    flat = np.fromiter(map(float, numbers), dtype=float, count=len(numbers)) if numbers != [""] else np.empty(0)
+    if len(flat) != 2 * len(every) or not np.isfinite(flat).all():
+        raise ValueError("a shape with points that are not x,y")
+    return flat.reshape(-1, 2), counts
+
+
+def _bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
+    if not lines:
+        return []
+    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
+    centres = shapely.linestrings(np.concatenate(lines), indices=owner)
+    bands = shapely.buffer(centres, np.maximum(widths, SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
+    return [band if isinstance(band, Polygon) else _polygons(band, largest=True) for band in bands]
+
+
+def _polygons(shape: shapely.Geometry, *, largest: bool) -> Any:
+    """The areas of a repaired shape: the largest as a Polygon, or all of them; None without any."""
+    parts = [p for p in shapely.get_parts(shapely.get_parts(shape)) if isinstance(p, Polygon) and p.area > 0.0]
+    if not parts:
+        return None
+    if largest or len(parts) == 1:
+        return max(parts, key=lambda part: part.area)
+    return MultiPolygon(parts)
+
+
+def _corners(areas: dict[str, Attributes], links: Sequence[Attributes]) -> dict[str, Polygon | MultiPolygon]:
+    """Polygons of the walking areas, repaired; specks are dropped unless they connect strips."""
+    if not areas:
+        return {}
+    joined: dict[str, set[str]] = defaultdict(set)
+    for link in links:
+        joined[link["from"]].add(link["to"])
+        joined[link["to"]].add(link["from"])
+    flat, counts = _coordinates([lane["shape"] for lane in areas.values()])
+    corners: dict[str, Polygon | MultiPolygon] = {}
+    rings = np.split(flat, np.cumsum(counts)[:-1])
+    shapes = [shapely.polygons(ring) if len(ring) > 2 else None for ring in rings]
+    for name, ring, shape in zip(areas, rings, shapely.make_valid(np.array(shapes, dtype=object)), strict=True):
+        polygon = None if shape is None else shape if isinstance(shape, Polygon) else _polygons(shape, largest=False)
+        if polygon is not None and polygon.area >= SPECK_M2:
+            corners[name] = polygon
+        elif len(joined[name]) > 1:
+            corners[name] = shapely.MultiPoint(ring).convex_hull.buffer(0.3)
+    return corners
+
+
+def _ports(
+    links: Sequence[Attributes],
+    walk: dict[str, tuple[_Edge, Attributes, int]],
+    corners: dict[str, Polygon | MultiPolygon],
+    lines: Sequence[Floats],
+) -> tuple[dict[tuple[str, int], str], set[str]]:
+    """Which corner lies at each end of each strip; and the ids of the signalised crossings."""
+    ports: dict[tuple[str, int], str] = {}
+    signalised: set[str] = set()
+    for link in links:
+        tail, head = link["from"], link["to"]
+        if head in corners and tail in walk and int(link.get("fromLane", 0)) == walk[tail][2]:
+            ports.setdefault((tail, 1), head)
+        elif tail in corners and head in walk and int(link.get("toLane", 0)) == walk[head][2]:
+            ports.setdefault((head, 0), tail)
+        if "tl" in link and head in walk and head.startswith(":"):
+            signalised.add(head)
+    # A crossing's line may run against its connections: the nearer corner is the right one.
+    for k, (name, (edge, _, _)) in enumerate(walk.items()):
+        if edge.attributes.get("function") == "crossing" and {(name, 0), (name, 1)} <= ports.keys():
+            first, last = corners[ports[name, 0]], corners[ports[name, 1]]
+            start, stop = Point(lines[k][0]), Point(lines[k][-1])
+            straight = first.distance(start) + last.distance(stop)
+            if straight > 1e-6 and first.distance(stop) + last.distance(start) < straight - 1e-6:
+                ports[name, 0], ports[name, 1] = ports[name, 1], ports[name, 0]
+    return ports, signalised
+
+
+def _strip(
+    edge: _Edge,
+    index: int,
+    left_hand: bool,
+    line: Floats,
+    width_m: float,
+    polygon: Polygon,
+    corners: tuple[str | None, str | None],
+    signalised: bool,
+) -> Strip:
+    name = edge.attributes["id"]
+    if edge.attributes.get("function") == "crossing":
+        crosses = tuple(edge.attributes.get("crossingEdges", "").split())
+        return Strip(
+            name,
+            "crossing",
+            line,
+            width_m,
+            polygon,
+            corners,
+            signalised,
+            crosses,
+            frontage_m=0.0,
+            curb_m=0.0,
+            road_side=0,
+        )
+    roads = [i for i, lane in enumerate(edge.lanes) if i != index and not _is_verge(lane)]
+    side = 0 if not roads else 1 if (roads[0] > index) != left_hand else -1
+    verges = [float(lane.get("width", LANE_M)) for lane in edge.lanes if _is_verge(lane)] if roads else []
+    number: Callable[[str, float], float] = lambda key, missing: float(edge.params.get(key, missing))  # noqa: E731
+    return Strip(
+        name,
+        "sidewalk",
+        line,
+        width_m,
+        polygon,
+        corners,
+        street_class=edge.params.get("street_class", edge.attributes.get("type", "")),
+        frontage_m=number("frontage_m", 2.0),
+        curb_m=number("curb_m", 0.3 if side else 0.0) + number("gutter_m", 0.0),
+        verge_m=number("verge_m", sum(verges)),
+        road_side=side,
+    )
+
+
+def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
+    outlined = [row for row in rows if row.get("type") != "internal" and row.get("shape", "").count(" ") > 1]
+    if not outlined:
+        return {}
+    flat, counts = _coordinates([row["shape"] for row in outlined])
+    shapes = [shapely.polygons(ring) for ring in np.split(flat, np.cumsum(counts)[:-1])]
+    junctions: dict[str, Junction] = {}
+    for row, shape in zip(outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True):
+        polygon = shape if isinstance(shape, Polygon) else _polygons(shape, largest=True)
+        if polygon is not None:
+            junctions[row["id"]] = Junction(row["id"], polygon, row.get("type", "").startswith("traffic_light"))
+    return junctions
+
+
+def _bounds(raw: _Raw, lines: Sequence[Floats]) -> tuple[float, float, float, float]:
+    if lines:
+        every = np.concatenate(lines)
+        low, high = every.min(axis=0), every.max(axis=0)
+    else:
+        low, high = np.array(raw.location["convBoundary"].split(","), dtype=float).reshape(2, 2)
+    return float(low[0]), float(low[1]), float(high[0]), float(high[1])

@@ -1,0 +1,109 @@
+"""Street nets of generated cities: built once by netconvert, kept in a cache folder, found again by name."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+from cosim.errors import MapError
+from cosim.scenario import City
+from sumo_nets.blocks import CLASSES, Line
+from sumo_nets.city import CityPlan, Edge, plan_city
+from sumo_nets.netfile import net_content_hash, netconvert, without_comments
+from sumo_nets.signals import with_programs
+
+GENERATOR = 1
+"""Version of the generator: another one for every change that changes a net."""
+CROSSING_M = 3.2
+NETCONVERT = (
+    "--walkingareas",
+    "--no-turnarounds.except-deadend",
+    "--junctions.corner-detail=8",
+    "--junctions.internal-link-detail=8",
+    "--offset.disable-normalization",
+    f"--default.crossing-width={CROSSING_M}",
+    "--default.sidewalk-width=3.2",
+)
+
+
+def cache_folder() -> Path:
+    """Where built nets are kept: $COSIM_CACHE, else ~/.cache/sidewalk-cosim."""
+    chosen = os.environ.get("COSIM_CACHE")
+    return Path(chosen) if chosen else Path.home() / ".cache" / "sidewalk-cosim"
+
+
+def city_net(city: City) -> Path:
+    """The city's street net, built when the cache has none.
+
+    Raises MapError when `city.net_hash` is set and the net is another one.
+    """
+    path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
+    if not path.exists():
+        build_city(city, path)
+    if city.net_hash and (found := net_content_hash(path)) != city.net_hash:
+        raise MapError(
+            f"{path}: the net's hash is {found}, but the scenario was made on {city.net_hash}: "
+            "delete the file to build it again; if the hash stays, the scenario is of another version of the "
+            "generator or of SUMO: make the suite anew, or install the version it was made with"
+        )
+    return path
+
+
+def build_city(city: City, path: Path) -> None:
+    """Build a city's net at `path`, in one move: several processes may build the same city at once."""
+    plan = plan_city(city.seed, city.size_m, city.style)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:
+            built = _build(plan, Path(folder))
+            finished = Path(folder) / path.name
+            finished.write_bytes(with_programs(without_comments(built.read_bytes()), plan.signal_rng))
+            finished.replace(path)
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written: {error.strerror}; set COSIM_CACHE to another folder") from error
+
+
+def _build(plan: CityPlan, folder: Path) -> Path:
+    nodes, edges, crossings = folder / "c.nod.xml", folder / "c.edg.xml", folder / "c.con.xml"
+    rows = []
+    for node in plan.nodes:
+        kind = "traffic_light" if node.signalised else "priority"
+        rows.append(f'<node id={quoteattr(node.id)} x="{node.at[0]:.2f}" y="{node.at[1]:.2f}" type="{kind}"/>')
+    nodes.write_text("<nodes>\n" + "\n".join(rows) + "\n</nodes>\n")
+    rings = [f'<roundabout nodes="{" ".join(r.nodes)}" edges="{" ".join(r.edges)}"/>' for r in plan.rings]
+    edges.write_text("<edges>\n" + "\n".join([*map(_edge, plan.edges), *rings]) + "\n</edges>\n")
+    zebras = [
+        f'<crossing node="{z.node}" edges="{" ".join(z.edges)}" width="{CROSSING_M}" priority="true"/>'
+        for z in plan.zebras
+    ]
+    crossings.write_text("<connections>\n" + "\n".join(zebras) + "\n</connections>\n")
+    return netconvert(["-n", str(nodes), "-e", str(edges), "-x", str(crossings), *NETCONVERT], folder / "built.net.xml")
+
+
+def _edge(edge: Edge) -> str:
+    """An edge with its sidewalk as lane 0, the verge next to it, then the lanes that are driven on."""
+    section = CLASSES[edge.street_class]
+    lanes = [f'allow="pedestrian" width="{section.sidewalk_m}"']
+    if section.verge_m:
+        lanes.append(f'disallow="all" width="{section.verge_m}" type="green_verge"')
+    lanes += [f'disallow="pedestrian" width="{section.lane_m}"'] * section.lanes
+    numbered = "".join(f'<lane index="{i}" {lane}/>' for i, lane in enumerate(lanes))
+    params = {
+        "street_class": edge.street_class,
+        "frontage_m": section.frontage_m,
+        "verge_m": section.verge_m,
+        "curb_m": section.curb_m,
+        "gutter_m": section.gutter_m,
+    }
+    zones = "".join(f'<param key="{key}" value="{value}"/>' for key, value in params.items())
+    return (
+        f'<edge id={quoteattr(edge.id)} from="{edge.tail}" to="{edge.head}" numLanes="{len(lanes)}" '
+        f'speed="{section.speed_mps}" priority="{section.priority}" type="{edge.street_class}" spreadType="right" '
+        f'shape="{_shape(edge.line)}">{numbered}{zones}</edge>'
+    )
+
+
+def _shape(line: Line) -> str:
+    return " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
