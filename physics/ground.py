@@ -1,0 +1,48 @@
+"""The place as the engines ask for it: tiles and buildings by key, heights by point; built when first needed."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cosim.geometry import Floats
+from cosim.streetmap import StreetMap
+from physics.buildings import Building, Frontage
+from physics.tiles import Key, Tile, build_tile, key_at
+
+_KEPT: Final = 100
+
+
+class Ground:
+    """Tiles and buildings of a street map under a seed; the least recently used tiles are forgotten."""
+
+    def __init__(self, street_map: StreetMap, seed: int) -> None:
+        self.street_map = street_map
+        self.seed = seed
+        self._frontage = Frontage(street_map, seed)
+        self._tiles: OrderedDict[Key, Tile] = OrderedDict()
+
+    def tile(self, key: Key) -> Tile:
+        if key not in self._tiles:
+            self._tiles[key] = build_tile(self.street_map, key)
+            if len(self._tiles) > _KEPT:
+                self._tiles.popitem(last=False)
+        self._tiles.move_to_end(key)
+        return self._tiles[key]
+
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """Buildings whose centre lies in the tile."""
+        return self._frontage.in_tile(key)
+
+    def heights(self, xy: ArrayLike) -> Floats:
+        """Height of the ground at (N, 2) points, (N,) metres."""
+        xy = np.asarray(xy, dtype=float).reshape(-1, 2)
+        height = np.zeros(len(xy))
+        keys = [key_at(x, y) for x, y in xy]
+        for key in dict.fromkeys(keys):
+            here = np.array([k == key for k in keys])
+            height[here] = self.tile(key).height(xy[here])
+        return height

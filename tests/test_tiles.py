@@ -1,0 +1,161 @@
+"""The ground and the buildings, as pure functions of a street map."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
+from physics.buildings import Frontage
+from physics.tiles import CURB_M, TILE_M, Tile, build_tile, distance_to, key_at, keys_within, square
+
+
+def tiny_map() -> StreetMap:
+    """A street along x with sidewalks on both sides, one crossing at x = 0, and a verge on the south side."""
+
+    def strip(name: str, x0: float, x1: float, y0: float, y1: float, corner: str, end: int, side: int) -> Strip:
+        line = np.array([[x0, (y0 + y1) / 2], [x1, (y0 + y1) / 2]])
+        corners = (None, corner) if end else (corner, None)
+        polygon = shapely.box(x0, y0, x1, y1)
+        return Strip(name, "sidewalk", line, y1 - y0, polygon, corners, frontage_m=2.0, road_side=side)
+
+    strips = [
+        strip("nw", -80, -2, 3.5, 6.5, "n", 1, -1),
+        strip("ne", 2, 80, 3.5, 6.5, "n", 0, -1),
+        strip("sw", -80, -2, -8, -5, "s", 1, 1),
+        strip("se", 2, 80, -8, -5, "s", 0, 1),
+        Strip(":c0", "crossing", np.array([[0, -3.5], [0, 3.5]]), 3.2, shapely.box(-1.6, -3.5, 1.6, 3.5), ("s", "n")),
+    ]
+    corners = [
+        Corner("n", shapely.box(-2, 3.5, 2, 6.5), (Port("nw", 1), Port("ne", 0), Port(":c0", 1))),
+        Corner("s", shapely.box(-2, -8, 2, -3.5), (Port("sw", 1), Port("se", 0), Port(":c0", 0))),
+    ]
+    lanes = [
+        Lane("e_1", "e", "road", np.array([[-80, -1.75], [80, -1.75]]), 3.5, shapely.box(-80, -3.5, 80, 0)),
+        Lane("-e_1", "-e", "road", np.array([[80, 1.75], [-80, 1.75]]), 3.5, shapely.box(-80, 0, 80, 3.5)),
+        Lane("e_0", "e", "verge", np.array([[-80, -4.25], [-2, -4.25]]), 1.5, shapely.box(-80, -5, -2, -3.5)),
+        Lane("f_0", "f", "verge", np.array([[2, -4.25], [80, -4.25]]), 1.5, shapely.box(2, -5, 80, -3.5)),
+    ]
+    return StreetMap(
+        "tiny",
+        (-80, -40, 80, 40),
+        {s.id: s for s in strips},
+        {c.id: c for c in corners},
+        {lane.id: lane for lane in lanes},
+        {},
+    )
+
+
+MAP = tiny_map()
+KEYS = keys_within(0.0, 0.0, 60.0)
+TILES = {key: build_tile(MAP, key) for key in KEYS}
+
+
+def triangles(tile: Tile, name: str) -> np.ndarray:
+    """(T, 3, 3) corners of one kind of ground."""
+    mesh = tile.parts[name]
+    return mesh.vertices[mesh.triangles]
+
+
+def plan_areas(corners: np.ndarray) -> np.ndarray:
+    """(T,) signed areas seen from above."""
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    return 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
+
+
+def test_a_tile_is_covered_once() -> None:
+    """The triangles of every tile, seen from above, fill its square exactly and none looks down."""
+    for tile in TILES.values():
+        areas = np.concatenate([plan_areas(triangles(tile, name)) for name in tile.parts])
+        assert areas.min() > -1e-9
+        assert abs(areas.sum() - TILE_M**2) < 1e-6
+
+
+def test_neighbouring_triangles_share_their_corners() -> None:
+    """Within a tile every edge off the border is shared by two triangles, walls and their feet included."""
+    for key, tile in TILES.items():
+        corners = np.concatenate([triangles(tile, name) for name in tile.parts])
+        points = np.rint(corners * 1e3).astype(int)
+        edges = {}
+        for triangle in points.tolist():
+            for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
+                edge = frozenset((tuple(a), tuple(b)))
+                edges[edge] = edges.get(edge, 0) + 1
+        x0, y0, x1, y1 = (round(1e3 * c) for c in square(key))
+        for edge, count in edges.items():
+            xs, ys = {p[0] for p in edge}, {p[1] for p in edge}
+            on_border = xs in ({x0}, {x1}) or ys in ({y0}, {y1}) or len(edge) == 1 or (len(xs) == len(ys) == 1)
+            assert count == 2 or on_border, (key, edge, count)
+
+
+def test_heights_meet_at_tile_borders() -> None:
+    """Two tiles agree on the height of points on their common border, on the ramps too."""
+    left, right = TILES[(-1, -1)], TILES[(0, -1)]
+    x = square((0, -1))[0]
+    border = np.column_stack([np.full(400, x), np.linspace(-20.0, -1e-3, 400)])
+    assert np.allclose(left.height(border), right.height(border), atol=1e-9)
+
+
+def test_the_curb_ramp_rises_one_in_twelve() -> None:
+    """From the crossing's end the corner climbs 1:12 to the curb's height; the flares follow the same rule."""
+    tile = build_tile(MAP, key_at(0.0, 5.0))
+    ahead = tile.height([[0.0, 3.5 + d] for d in (0.001, 0.36, 0.72, 1.44, 2.0)])
+    assert np.allclose(ahead, [0.0, 0.03, 0.06, 0.12, 0.12], atol=2e-4)
+    mesh = tile.parts["ramp"]
+    assert np.allclose(mesh.vertices[:, 2], tile.height(mesh.vertices[:, :2] + [0.0, 1e-9]), atol=1e-6)
+
+
+def test_the_kinds_of_ground_lie_where_the_map_says() -> None:
+    """Triangles' middles: sidewalk on strips, stripes on the crossing, road on lanes, verge on the verge."""
+    where = {
+        "road": shapely.box(-80, -3.5, 80, 3.5),
+        "stripe": shapely.box(-1.6, -3.5, 1.6, 3.5),
+        "crossing": shapely.box(-1.6, -3.5, 1.6, 3.5),
+        "sidewalk": shapely.box(-80, -8, 80, 6.5),
+        "verge": shapely.box(-80, -5, 80, -3.5),
+    }
+    for tile in TILES.values():
+        for name, area in where.items():
+            if name in tile.parts:
+                middle = triangles(tile, name).mean(axis=1)
+                assert shapely.contains_xy(area, middle[:, 0], middle[:, 1]).all()
+                assert np.allclose(triangles(tile, name)[..., 2] <= CURB_M + 1e-9, True)
+
+
+def test_tiles_do_not_depend_on_the_order() -> None:
+    """A tile built alone equals the same tile built after others."""
+    again = build_tile(tiny_map(), (0, -1))
+    for name, mesh in TILES[(0, -1)].parts.items():
+        assert np.array_equal(mesh.vertices, again.parts[name].vertices)
+        assert np.array_equal(mesh.triangles, again.parts[name].triangles)
+
+
+def test_keys_cover_a_disk() -> None:
+    """The tiles within a radius hold every point of the disk, and each is no farther than the radius."""
+    keys = keys_within(13.0, -7.0, 30.0)
+    angle = np.linspace(0.0, 6.28, 60)
+    assert {key_at(13.0 + 29.9 * np.cos(a), -7.0 + 29.9 * np.sin(a)) for a in angle} <= set(keys)
+    assert all(distance_to(key, 13.0, -7.0) <= 30.0 for key in keys)
+
+
+def test_buildings_line_the_street_and_keep_off_it() -> None:
+    """Both sides have buildings, none over walkable ground or road, and they begin at the frontage distance."""
+    frontage = Frontage(MAP, seed=4)
+    built = [b for key in keys_within(0.0, 0.0, 100.0) for b in frontage.in_tile(key)]
+    street = shapely.box(-80, -8, 80, 6.5)
+    assert len(built) > 12
+    assert {b.id.split(":")[1] for b in built} == {"nw", "ne", "sw", "se"}
+    gaps = [shapely.distance(b.polygon, street) for b in built]
+    assert np.allclose(gaps, 2.0)
+    assert all(6.0 <= b.size_m[2] <= 25.0 for b in built)
+
+
+def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
+    """Tiles asked for in any order hold the same buildings; another seed gives others."""
+    one, two, other = Frontage(MAP, 4), Frontage(MAP, 4), Frontage(MAP, 5)
+    forward = {key: one.in_tile(key) for key in KEYS}
+    backward = {key: two.in_tile(key) for key in reversed(KEYS)}
+    assert forward == backward
+    assert forward != {key: other.in_tile(key) for key in KEYS}
+    ids = [b.id for buildings in forward.values() for b in buildings]
+    assert len(ids) == len(set(ids))
