@@ -56,7 +56,8 @@ class Log:
         """Write as .npz, whole or not at all."""
         temporary = path.with_name(path.name + ".part")
         with temporary.open("wb") as file:
-            np.savez_compressed(file, **{f.name: np.asarray(getattr(self, f.name)) for f in fields(self)})
+            arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+            np.savez_compressed(file, allow_pickle=False, **arrays)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
@@ -172,10 +173,9 @@ class Recorder:
         travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
         away = np.hypot(*(people.xy - robot.pose.xy).T) if len(people) else np.array([np.inf])
         reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
-        self._rows.append(
-            (*robot.pose, robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
-            + (step.route_s_after_m, travelled_m, float(away.min()), reset_s_m, float(verdict.waits_at_red))
-        )
+        speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
+        measured = (step.route_s_after_m, travelled_m, float(away.min()), reset_s_m, float(verdict.waits_at_red))
+        self._rows.append((*robot.pose, *speeds, *measured))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             for i in np.flatnonzero(away[: len(people)] < self.PEOPLE_WITHIN_M):
                 x, y = people.xy[i]

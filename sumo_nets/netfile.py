@@ -24,6 +24,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from cosim.errors import MapError
 from cosim.geometry import Floats
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
+from sumo_nets.seams import close_seams
 
 LANE_M = 3.2
 """SUMO's width of a lane, sidewalks included, that names none."""
@@ -178,6 +179,8 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     bands = _bands(lines, widths)
     corners = _corners(areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
+    met = [(corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), ""))) for name in walk]
+    bands[: len(walk)] = close_seams(bands[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))

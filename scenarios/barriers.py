@@ -1,0 +1,109 @@
+"""Closing every branch of a way with barriers, and the proof that exactly one walkable path remains."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon
+
+from cosim.errors import SpecError
+from cosim.geometry import Polyline
+from cosim.scenario import Barrier
+from cosim.streetmap import Port, StreetMap, union_closed
+
+INTO_STRIP_M = 0.5
+"""A sidewalk is closed this far from its corner; a crossing at its edge, so that the road stays free."""
+
+OVERHANG_M = 0.12
+THICKNESS_M = 0.16
+SEAM_HOLE_M2 = 0.25
+"""Smaller holes in the walkable area are seams of the net, not ways round something."""
+
+REACH_M = 30.0
+"""The walkable area is examined this far around the way; what can be reached must end before."""
+
+
+def branches(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
+    """The ports to close: all others at the corners of a way, and the far ends of its first and last strip."""
+    corners = sorted({corner_of(street_map, port) for port in way} - {""})
+    inner = {port for corner in corners for port in street_map.corners[corner].ports} - set(way)
+    ends = {port for port in (way[0].other, way[-1].other) if corner_of(street_map, port)}
+    return sorted(inner | ends)
+
+
+def corner_of(street_map: StreetMap, port: Port) -> str:
+    """Id of the corner at a port, "" at a dead end."""
+    return street_map.strips[port.strip].corners[port.end] or ""
+
+
+def barrier_at(street_map: StreetMap, port: Port) -> Barrier:
+    """The barrier that closes a port."""
+    strip = street_map.strips[port.strip]
+    line = Polyline(strip.line[:, :2] if port.end == 0 else strip.line[::-1, :2])
+    into_m = min(INTO_STRIP_M, line.length_m / 2) if strip.kind == "sidewalk" else -THICKNESS_M / 2 + 0.02
+    pose = line.at(max(into_m, 0.0))
+    back_m = min(into_m, 0.0)
+    return Barrier(
+        x_m=pose.x_m + back_m * math.cos(pose.heading_rad),
+        y_m=pose.y_m + back_m * math.sin(pose.heading_rad),
+        heading_rad=pose.heading_rad,
+        length_m=strip.width_m + 2 * OVERHANG_M,
+        strip=port.strip,
+        end=port.end,
+        thickness_m=THICKNESS_M,
+    )
+
+
+def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
+    """The ground that a barrier covers, grown by a margin."""
+    cos, sin = math.cos(barrier.heading_rad), math.sin(barrier.heading_rad)
+    half = barrier.length_m / 2
+    line = LineString(
+        [
+            (barrier.x_m - half * sin, barrier.y_m + half * cos),
+            (barrier.x_m + half * sin, barrier.y_m - half * cos),
+        ]
+    )
+    return shapely.buffer(line, barrier.thickness_m / 2 + margin_m, cap_style="flat")
+
+
+def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon | MultiPolygon:
+    """The walkable area minus the ground of the barriers."""
+    fences = [outline(barrier) for barrier in barriers]
+    return shapely.difference(area, shapely.union_all(np.array(fences, dtype=object))) if fences else area
+
+
+def prove_single_path(
+    street_map: StreetMap, route: Polyline, barriers: Sequence[Barrier], way: Sequence[Port], half_width_m: float
+) -> Polygon:
+    """The area that can be reached from the start, once exactly one path leads to the goal. SpecError otherwise.
+
+    What is shown, on the walkable polygon itself: (1) the part of walkable-minus-barriers that holds the start holds
+    the goal; (2) it ends within REACH_M of the way, so nothing leads elsewhere; (3) it has no hole, and in an area
+    without holes all paths between two points are the same but for bending; (4) start and goal stay connected when
+    the area is eroded by half the robot's width, so the robot fits through.
+    """
+    strips = union_closed([street_map.strips[port.strip].polygon for port in way])
+    surroundings = shapely.buffer(shapely.union(strips, LineString(route.points)), REACH_M)
+    free = fenced(street_map.walkable_near(surroundings), barriers)
+    start, goal = Point(route.points[0]), Point(route.points[-1])
+    part = _part_with(free, start)
+    if part is None or not part.covers(goal):
+        raise SpecError("start and goal are not connected")
+    if not shapely.buffer(surroundings, -0.5).covers(part):
+        raise SpecError("a branch is left open: the area reached leads away from the route")
+    holes = [ring for ring in part.interiors if Polygon(ring).area >= SEAM_HOLE_M2]
+    if holes:
+        x, y = Polygon(holes[0]).centroid.coords[0]
+        raise SpecError(f"two ways remain: they lead round ({x:.1f}, {y:.1f})")
+    passable = _part_with(shapely.buffer(part, -half_width_m), start)
+    if passable is None or not passable.covers(goal):
+        raise SpecError(f"somewhere the way is narrower than {2 * half_width_m:.2f} m")
+    return part
+
+
+def _part_with(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:
+    return next((part for part in shapely.get_parts(area) if part.covers(point)), None)

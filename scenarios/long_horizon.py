@@ -1,0 +1,169 @@
+"""Builder of long-horizon scenarios: start and goal far apart in a city, one walkable path, street life, events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from cosim.errors import CosimError, MapError, SpecError
+from cosim.events import Event, Kind
+from cosim.geometry import Polyline
+from cosim.scenario import City, CrowdSpec, RouteCrossing, Scenario
+from cosim.streetmap import Port, StreetMap, Strip
+from cosim.walks import WalkGraph
+from cosim.wayline import way_line
+from scenarios.barriers import barrier_at, branches, prove_single_path
+
+SHORTEST_M = 120.0
+LONGEST_M = 560.0
+STRIP_MIN_M = 30.0
+"""Start and goal lie on sidewalks at least this long."""
+
+HALF_WIDTH_M = 0.32
+CROSSING_EVERY_M = 160.0
+EVENT_EVERY_M = 90.0
+EVENT_KINDS: tuple[Kind, ...] = ("obstructing", "frontal")
+EVENT_WALKWAY_M = 3.0
+"""Events take place on sidewalks at least this wide: there is room to pass."""
+
+EVENT_STRAIGHT_M = 24.0
+EVENT_BEND_M = 0.4
+TRIES = 400
+
+
+def build(city: City, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
+    """A scenario drawn from `seed`. Raises SpecError when none of many draws has exactly one path to the goal."""
+    rng = np.random.default_rng([seed, city.seed, 0x10E6])
+    candidates = sorted(
+        strip_id
+        for strip_id in graph.main_strips
+        if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= STRIP_MIN_M
+    )
+    if not candidates:
+        raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")
+    refusals: dict[str, int] = {}
+    for _ in range(TRIES):
+        try:
+            return _draw(city, street_map, graph, rng, candidates, seed, scenario_id)
+        except CosimError as refusal:
+            reason = str(refusal).split(":")[0]
+            refusals[reason] = refusals.get(reason, 0) + 1
+    told = "; ".join(f"{reason} ({n} times)" for reason, n in sorted(refusals.items(), key=lambda r: -r[1]))
+    raise SpecError(f"no long-horizon route on '{street_map.name}' with seed {seed} in {TRIES} draws: {told}")
+
+
+def _draw(
+    city: City,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    candidates: Sequence[str],
+    seed: int,
+    scenario_id: str,
+) -> Scenario:
+    way, start_m, goal_m = draw_way(street_map, graph, rng, candidates)
+    route = way_line(street_map, way, start_m, goal_m)
+    if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
+        raise SpecError("length of the line does not fit")
+    barriers = tuple(barrier_at(street_map, port) for port in branches(street_map, way))
+    prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+    start, goal = route.at(0.0), route.at(route.length_m)
+    return Scenario(
+        id=scenario_id,
+        suite="long-horizon",
+        place=City(seed=city.seed, size_m=city.size_m, style=city.style, net_hash=street_map.net_hash),
+        seed=seed,
+        start=(start.x_m, start.y_m, start.heading_rad),
+        goal=(goal.x_m, goal.y_m),
+        route=tuple((float(x), float(y)) for x, y in route.points),
+        crossings=route_crossings(street_map, route, way),
+        barriers=barriers,
+        events=draw_events(street_map, route, way, rng),
+        crowd=CrowdSpec(),
+        time_limit_s=max(300.0, route.length_m / 0.2),
+    )
+
+
+def draw_way(
+    street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str]
+) -> tuple[list[Port], float, float]:
+    """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line` takes it."""
+    target_m = rng.uniform(SHORTEST_M, LONGEST_M)
+    strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
+    leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
+    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    closed = frozenset({leave.other})
+    reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
+    goals = [port for port in reach.within(target_m - start_m - 60.0, target_m - start_m) if port.strip in candidates]
+    if not goals:
+        raise SpecError("no goal at the drawn distance")
+    goal = goals[int(rng.integers(len(goals)))]
+    way = reach.path(goal)
+    if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
+        raise SpecError("the way passes its goal")
+    crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
+    if crossed < max(1, round(target_m / CROSSING_EVERY_M)):
+        raise SpecError("the way crosses too few streets")
+    goal_strip = street_map.strips[goal.strip]
+    return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
+
+
+def route_crossings(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[RouteCrossing, ...]:
+    """The crossings of a way, in order, with the arc lengths between which the route is on them."""
+    found = []
+    for port in way[::2]:
+        strip = street_map.strips[port.strip]
+        if strip.kind != "crossing":
+            continue
+        ends = sorted(route.project(*strip.line[i, :2])[0] for i in (0, -1))
+        found.append(RouteCrossing(id=strip.id, enter_s_m=ends[0], leave_s_m=ends[1], signalised=strip.signalised))
+    return tuple(sorted(found, key=lambda crossing: crossing.enter_s_m))
+
+
+def draw_events(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port], rng: np.random.Generator
+) -> tuple[Event, ...]:
+    """Events about every EVENT_EVERY_M metres, on straight and wide pieces of sidewalk."""
+    places = []
+    for s_m in np.arange(35.0, route.length_m - 25.0, 5.0):
+        strip = _sidewalk_at(street_map, way, route, float(s_m))
+        if strip is not None and strip.width_m >= EVENT_WALKWAY_M and _is_straight(route, float(s_m)):
+            places.append((float(s_m), strip.width_m / 2))
+    events: list[Event] = []
+    next_s_m = 0.0
+    kinds = list(rng.permutation(np.array(EVENT_KINDS)))
+    for s_m, half_width_m in places:
+        if s_m < next_s_m:
+            continue
+        pose = route.at(s_m)
+        events.append(
+            Event(
+                id=f"e{len(events)}",
+                kind=str(kinds[len(events) % len(kinds)]),  # type: ignore[arg-type]
+                x_m=pose.x_m,
+                y_m=pose.y_m,
+                heading_rad=pose.heading_rad,
+                route_s_m=s_m,
+                half_width_m=half_width_m,
+                speed_mps=float(rng.uniform(1.1, 1.65)),
+                side=1 if rng.random() < 0.5 else -1,
+            )
+        )
+        next_s_m = s_m + float(rng.uniform(0.6, 1.4)) * EVENT_EVERY_M
+    return tuple(events)
+
+
+def _sidewalk_at(street_map: StreetMap, way: Sequence[Port], route: Polyline, s_m: float) -> Strip | None:
+    """The sidewalk of the way at an arc length of the route, None on corners and crossings."""
+    pose = route.at(s_m)
+    strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
+    return strip if strip is not None and strip.kind == "sidewalk" and strip.id in {p.strip for p in way} else None
+
+
+def _is_straight(route: Polyline, s_m: float) -> bool:
+    """Whether the route bends by less than EVENT_BEND_M in the stretch before and a little behind a place."""
+    from_m, to_m = s_m - EVENT_STRAIGHT_M, s_m + 5.0
+    chord = Polyline([route.at(from_m).xy, route.at(to_m).xy])
+    between = route.points[(route.s_m > from_m) & (route.s_m < to_m)]
+    return all(abs(chord.project(x, y)[1]) < EVENT_BEND_M for x, y in between)

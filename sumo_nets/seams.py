@@ -1,0 +1,61 @@
+"""Closing the wedge between a strip's square end and the slanting edge of the corner that it meets.
+
+SUMO stores a sidewalk or crossing as a middle line and a width. Where it meets its corner at an angle, the band
+around the line leaves a gap on one side that is nothing but an artefact, and that nobody could drive over without
+"leaving" the walkable area.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
+
+from cosim.geometry import Floats
+
+REACH_M = 0.6
+"""How far beyond its end a strip may look for its corner."""
+
+Polygons = NDArray[np.object_]
+
+
+def close_seams(
+    polygons: Sequence[Polygon],
+    lines: Sequence[Floats],
+    widths_m: Floats,
+    corners: Sequence[tuple[shapely.Geometry | None, shapely.Geometry | None]],
+) -> list[Polygon]:
+    """The polygons of N strips, extended at both ends to the edges of their corners (None: no corner there)."""
+    if not len(polygons):
+        return []
+    grown = np.array(polygons, dtype=object)
+    for side, (end, inner) in enumerate(((0, 1), (-1, -2))):
+        at = np.array([line[end, :2] for line in lines])
+        before = np.array([line[inner, :2] for line in lines])
+        grown = joined(grown, at, before, widths_m, np.array([pair[side] for pair in corners], dtype=object))
+    return list(grown)
+
+
+def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, corners: Polygons) -> Polygons:
+    """Strips extended at one end to the edge of their corner.
+
+    polygons: (N,) of the strips. ends, inner: (N, 2) metres, the last point of each middle line at that end and the
+    one before. widths_m: (N,). corners: (N,) polygons, None where a strip ends nowhere. Returns (N,) polygons.
+    """
+    forth = ends - inner
+    forth /= np.maximum(np.hypot(forth[:, 0], forth[:, 1]), 1e-9)[:, None]
+    aside = np.column_stack([-forth[:, 1], forth[:, 0]]) * (widths_m / 2)[:, None]
+    left, right = ends + aside, ends - aside
+    beyond = shapely.polygons(np.stack([right, left, left + REACH_M * forth, right + REACH_M * forth], axis=1))
+    edges = shapely.linestrings(np.stack([right, left], axis=1))
+    met = shapely.intersection(beyond, corners)
+    wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
+    wedges = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
+    grown = shapely.union(polygons, wedges)
+    whole = shapely.get_type_id(grown) == 3
+    out: Polygons = polygons.copy()
+    out[wanted & whole] = grown[wanted & whole]
+    return out
