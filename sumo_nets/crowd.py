@@ -19,7 +19,7 @@ import numpy as np
 
 from cosim.errors import EngineError
 from cosim.events import Actor, EventReply
-from cosim.geometry import heading_from_sumo
+from cosim.geometry import Pose, heading_from_sumo
 from cosim.ports import Crowd
 from cosim.scenario import CrowdSpec
 from cosim.state import People, RobotState, Street, Vehicles
@@ -110,13 +110,13 @@ class SumoCrowd(Crowd):
         """One tick on, with the robot and the event pedestrians where they are now."""
         tick = self.street.tick
         with _translated(f"stepping from tick {tick}"):
-            x_m, y_m, heading_rad = robot.pose
+            x_m, y_m = robot.pose[:2]
             libsumo.poi.setPosition(EYE, x_m, y_m)
             if tick % ROLL_TICKS == 0:
                 persons, vehicles = self._seen
                 self._pedestrians.roll(x_m, y_m, persons, self._waits_at_red)
                 self._drivers.roll(x_m, y_m, vehicles)
-            self._robot.update(x_m, y_m, heading_rad)
+            self._robot.update(robot.pose)
             self._mirror(reply.actors)
             libsumo.simulationStep()
             self._street = self._read(tick + 1, x_m, y_m, reply.actors)
@@ -179,7 +179,7 @@ class SumoCrowd(Crowd):
         for actor in actors:
             if actor.id not in self._actors:
                 self._actors[actor.id] = Proxy(libsumo, self._walks, base=actor.id, kind="event", serial=self._serial)
-            self._actors[actor.id].update(actor.x_m, actor.y_m, actor.heading_rad)
+            self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
         persons: dict[str, Row] = {}

@@ -7,13 +7,13 @@ the place changes. Other ways of moving a person (free mapping, a walk of one wa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
-import numpy as np
 import shapely
 
-from cosim.geometry import heading_to_sumo
+from cosim.geometry import Pose, heading_to_sumo
 from cosim.streetmap import Located, StreetMap
 
 KEEP_ROUTE = 3
@@ -23,6 +23,8 @@ KEEP_ROUTE_ON_ROAD = 7
 """The same with car lanes allowed: cars stop for somebody on the carriageway."""
 
 MATCH_M = 100.0
+END_M = 2.0
+"""Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the corner."""
 
 
 class Walk(NamedTuple):
@@ -49,19 +51,19 @@ class Walks:
                 for junction in dict.fromkeys(ends):
                     self._at.setdefault(junction, []).append(strip.id)
 
-    def serves(self, walk: Walk, edge: str, heading_rad: float) -> bool:
+    def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
         """Whether SUMO sees a proxy on `edge` when it has `walk`."""
         if edge.startswith(":"):
             return walk.junction == junction_of(edge) == self._ends[walk.first][1]
-        return walk.first == edge and walk.junction == self._ahead(edge, heading_rad)
+        return walk.first == edge and walk.junction == self._ahead(edge, pose)
 
-    def choose(self, edge: str, heading_rad: float) -> Walk | None:
+    def choose(self, edge: str, pose: Pose) -> Walk | None:
         """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
         if edge.startswith(":"):
             junction = junction_of(edge)
             firsts = self._into.get(junction, [])
         elif edge in self._ends:
-            junction = self._ahead(edge, heading_rad)
+            junction = self._ahead(edge, pose)
             firsts = [edge]
         else:
             return None
@@ -75,10 +77,17 @@ class Walks:
                 fallback = fallback or Walk(junction, first, second)
         return fallback
 
-    def _ahead(self, edge: str, heading_rad: float) -> str:
-        line = self.street_map.strips[edge].line
-        dx, dy = line[-1] - line[0]
-        return self._ends[edge][1 if dx * np.cos(heading_rad) + dy * np.sin(heading_rad) >= 0.0 else 0]
+    def _ahead(self, edge: str, pose: Pose) -> str:
+        """The junction at the end of a sidewalk that a pose heads to.
+
+        Near the end where the edge ends it is always that one: SUMO may map a proxy there to the walking area, and
+        crashes when its walk turns away from it.
+        """
+        strip = self.street_map.strips[edge]
+        (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
+        forward = (x1 - x0) * math.cos(pose.heading_rad) + (y1 - y0) * math.sin(pose.heading_rad) >= 0.0
+        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + END_M
+        return self._ends[edge][1 if forward or at_end else 0]
 
 
 class Proxy:
@@ -94,14 +103,15 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
 
-    def update(self, x_m: float, y_m: float, heading_rad: float) -> None:
+    def update(self, pose: Pose) -> None:
         """Put it at a pose. To be called before every step of the simulation, or it walks on by itself."""
+        x_m, y_m, heading_rad = pose
         place = self._locate(x_m, y_m)
         walk = self._walk
         if place.kind == "off":
             walk = None
-        elif walk is None or not self._walks.serves(walk, place.edge, heading_rad):
-            walk = self._walks.choose(place.edge, heading_rad)
+        elif walk is None or not self._walks.serves(walk, place.edge, pose):
+            walk = self._walks.choose(place.edge, pose)
         if walk != self._walk or self._name is None:
             self.remove()
             if walk is not None:
