@@ -1,7 +1,7 @@
 """What a street is made of: centre lines (straight, curve, S-bend, rounded corner, ring) and cross-sections, in metres.
 
 Together with the T, X and Y junctions that the plan of a city makes of them these are the seven primitive blocks.
-Trigonometry goes through `math` and never through SIMD kernels, so lines are equal to the bit on every machine.
+Trigonometry goes through `math`, not through numpy's kernels, which differ between processors.
 """
 
 from __future__ import annotations

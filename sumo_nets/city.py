@@ -308,12 +308,12 @@ def _place_roundabouts(draft: _Draft, rng: np.random.Generator, share: float) ->
     """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from each other."""
     last, arms = max(draft.at)[0], draft.arms()
     for cell, mine in arms.items():
-        radius, draw = float(rng.uniform(17.0, 21.0)), rng.random()
+        radius, draw = float(rng.uniform(19.0, 22.0)), rng.random()
         if draw > share or len(mine) < 3 or {0, last} & set(cell):
             continue
         near = {end for link in mine for end in (link.a, link.b)}
         quiet = all(CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine)
-        if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(68.0):
+        if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(74.0):
             draft.rings[cell] = radius
 
 

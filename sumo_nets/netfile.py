@@ -14,7 +14,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 from xml.parsers import expat
 
 import numpy as np
@@ -24,12 +24,12 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from cosim.errors import MapError
 from cosim.geometry import Floats
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
+from sumo_nets.outlines import areas_of, bands, coordinates, polylines
 from sumo_nets.seams import close_seams
 
 LANE_M = 3.2
 """SUMO's width of a lane, sidewalks included, that names none."""
 SPECK_M2 = 0.5
-SHORTEST_M = 0.1
 
 Attributes = dict[str, str]
 
@@ -74,8 +74,10 @@ def read_net(path: Path) -> StreetMap:
     raw = _parse(path, data)
     try:
         return _street_map(path, raw, _hash(data))
-    except (ValueError, KeyError, IndexError, shapely.errors.GEOSException) as error:
-        raise MapError(f"{path}: not a street net that can be read: {type(error).__name__}: {error}") from error
+    except KeyError as error:
+        raise MapError(f"{path}: not a street net that can be read: attribute {error} is missing") from error
+    except (ValueError, IndexError, shapely.errors.GEOSException) as error:
+        raise MapError(f"{path}: not a street net that can be read: {error}") from error
 
 
 def _load(path: Path) -> bytes:
@@ -145,7 +147,7 @@ def _parse(path: Path, data: bytes) -> _Raw:
     parser.EndElementHandler = end
     try:
         parser.Parse(data, True)
-    except expat.ExpatError as error:
+    except (expat.ExpatError, LookupError, ValueError) as error:
         raise MapError(f"{path}: broken XML: {error}") from error
     if not raw.net:
         raise MapError(f"{path}: not a SUMO street net: it has no <net>")
@@ -174,17 +176,17 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
                 driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
     left_hand = raw.net.get("lefthand") in ("true", "1")
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
-    lines = _lines([lane["shape"] for lane in lanes])
+    lines = polylines([lane["shape"] for lane in lanes])
     widths = np.array([float(lane.get("width", LANE_M)) for lane in lanes])
-    bands = _bands(lines, widths)
+    polygons = bands(lines, widths)
     corners = _corners(areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
     met = [(corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), ""))) for name in walk]
-    bands[: len(walk)] = close_seams(bands[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
+    polygons[: len(walk)] = close_seams(polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))
-        strips[name] = _strip(edge, index, left_hand, lines[k], float(widths[k]), bands[k], ends, name in signalised)
+        strips[name] = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends, name in signalised)
     roads = {
         lane["id"]: Lane(
             id=lane["id"],
@@ -192,7 +194,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             kind=kind,
             line=lines[k],
             width_m=float(widths[k]),
-            polygon=bands[k],
+            polygon=polygons[k],
             internal=edge.attributes.get("function", "") == "internal",
         )
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
@@ -231,51 +233,6 @@ def _is_verge(lane: Attributes) -> bool:
     return lane.get("type", "") == "green_verge" or lane.get("disallow") == "all" or lane.get("allow") == ""
 
 
-def _lines(shapes: Sequence[str]) -> list[Floats]:
-    """(N, 2) metres of every shape, N >= 2 and never of zero length; elevations are dropped."""
-    flat, counts = _coordinates(shapes)
-    lines = np.split(flat, np.cumsum(counts)[:-1])
-    for i, line in enumerate(lines):
-        if len(line) < 2 or (len(line) == 2 and abs(line[1] - line[0]).sum() < 1e-3):
-            lines[i] = line[0] + np.array([[-SHORTEST_M / 2.0, 0.0], [SHORTEST_M / 2.0, 0.0]])
-        lines[i].flags.writeable = False
-    return lines
-
-
-def _coordinates(shapes: Sequence[str]) -> tuple[Floats, list[int]]:
-    """All points of all shapes, (sum of counts, 2) metres, and the count of each."""
-    points = [shape.split() for shape in shapes]
-    counts = [len(row) for row in points]
-    if not all(counts):
-        raise ValueError("a shape without points")
-    every = [point for row in points for point in row]
-    # Points with and without elevation mix, even in one shape.
-    numbers = ",".join(p if p.count(",") == 1 else ",".join(p.split(",")[:2]) for p in every).split(",")
-    flat = np.fromiter(map(float, numbers), dtype=float, count=len(numbers)) if numbers != [""] else np.empty(0)
-    if len(flat) != 2 * len(every) or not np.isfinite(flat).all():
-        raise ValueError("a shape with points that are not x,y")
-    return flat.reshape(-1, 2), counts
-
-
-def _bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
-    if not lines:
-        return []
-    owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
-    centres = shapely.linestrings(np.concatenate(lines), indices=owner)
-    bands = shapely.buffer(centres, np.maximum(widths, SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
-    return [band if isinstance(band, Polygon) else _polygons(band, largest=True) for band in bands]
-
-
-def _polygons(shape: shapely.Geometry, *, largest: bool) -> Any:
-    """The areas of a repaired shape: the largest as a Polygon, or all of them; None without any."""
-    parts = [p for p in shapely.get_parts(shapely.get_parts(shape)) if isinstance(p, Polygon) and p.area > 0.0]
-    if not parts:
-        return None
-    if largest or len(parts) == 1:
-        return max(parts, key=lambda part: part.area)
-    return MultiPolygon(parts)
-
-
 def _corners(areas: dict[str, Attributes], links: Sequence[Attributes]) -> dict[str, Polygon | MultiPolygon]:
     """Polygons of the walking areas, repaired; specks are dropped unless they connect strips."""
     if not areas:
@@ -284,12 +241,12 @@ def _corners(areas: dict[str, Attributes], links: Sequence[Attributes]) -> dict[
     for link in links:
         joined[link["from"]].add(link["to"])
         joined[link["to"]].add(link["from"])
-    flat, counts = _coordinates([lane["shape"] for lane in areas.values()])
+    flat, counts = coordinates([lane["shape"] for lane in areas.values()])
     corners: dict[str, Polygon | MultiPolygon] = {}
     rings = np.split(flat, np.cumsum(counts)[:-1])
     shapes = [shapely.polygons(ring) if len(ring) > 2 else None for ring in rings]
     for name, ring, shape in zip(areas, rings, shapely.make_valid(np.array(shapes, dtype=object)), strict=True):
-        polygon = None if shape is None else shape if isinstance(shape, Polygon) else _polygons(shape, largest=False)
+        polygon = None if shape is None else shape if isinstance(shape, Polygon) else areas_of(shape, largest=False)
         if polygon is not None and polygon.area >= SPECK_M2:
             corners[name] = polygon
         elif len(joined[name]) > 1:
@@ -374,11 +331,11 @@ def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
     outlined = [row for row in rows if row.get("type") != "internal" and row.get("shape", "").count(" ") > 1]
     if not outlined:
         return {}
-    flat, counts = _coordinates([row["shape"] for row in outlined])
+    flat, counts = coordinates([row["shape"] for row in outlined])
     shapes = [shapely.polygons(ring) for ring in np.split(flat, np.cumsum(counts)[:-1])]
     junctions: dict[str, Junction] = {}
     for row, shape in zip(outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True):
-        polygon = shape if isinstance(shape, Polygon) else _polygons(shape, largest=True)
+        polygon = shape if isinstance(shape, Polygon) else areas_of(shape, largest=True)
         if polygon is not None:
             junctions[row["id"]] = Junction(row["id"], polygon, row.get("type", "").startswith("traffic_light"))
     return junctions
