@@ -16,6 +16,11 @@ def name(value: str) -> str:
     return value
 
 
+def chunk(value: str) -> str:
+    """Any name made fit to stand in a key: what may not stand there becomes "-"."""
+    return name(re.sub(r"[^A-Za-z0-9_-]", "-", value)[:64])
+
+
 def director(run: str, env: str) -> str:
     """Where the simulator of one environment asks for the event pedestrians of a tick."""
     return f"cosim/{name(run)}/env/{name(env)}/director"

@@ -23,7 +23,7 @@ from cosim.step import Step
 
 SCHEMA = 1
 
-Status = Literal["done", "invalid", "crashed"]
+Status = Literal["done", "crashed"]
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible."""
+    """What came out of one episode. reason: why it crashed. clock: wall times, not reproducible."""
 
     scenario: str
     scenario_hash: str

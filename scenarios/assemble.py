@@ -1,0 +1,103 @@
+"""The only wiring of engines: a scenario and a policy become running Parts."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib.metadata import version
+from pathlib import Path
+
+import shapely
+from shapely.geometry import LineString
+
+from bridge import keys
+from bridge.director import RemoteDirector, serve_director
+from bridge.session import Session
+from cosim.clock import Clock
+from cosim.control import Limits
+from cosim.errors import PolicyError
+from cosim.loop import Parts
+from cosim.ports import Director, Manifest, Policy
+from cosim.scenario import City, Scenario
+from cosim.streetmap import Port, StreetMap, WalkableArea
+from physics.camera import BulletCamera
+from physics.world import BulletWorld
+from scenarios.barriers import fenced
+from scenarios.behaviors import react
+from sumo_nets.crowd import SumoCrowd
+from sumo_nets.netfile import read_net
+from sumo_nets.store import city_net
+
+CORRIDOR_M = 40.0
+"""The walkable area is judged this far around the route; beyond it everything is out of lane."""
+
+PACKAGES = ("sidewalk-cosim", "libsumo", "eclipse-sumo", "pybullet", "eclipse-zenoh", "numpy", "scipy", "shapely")
+
+
+@dataclass(frozen=True, slots=True)
+class Stage:
+    """A scenario ready to run. area: where the robot may be, for the referee."""
+
+    parts: Parts
+    area: WalkableArea
+    clock: Clock
+    renderer: str
+
+
+@contextmanager
+def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
+    """Start every engine of a scenario; all are closed at the end, whatever happened."""
+    manifest = manifest_of(policy)
+    clock = Clock.for_rate(manifest.rate_hz)
+    net_path, street_map = place(scenario.place)
+    walkable = street_map.walkable_near(shapely.buffer(LineString(scenario.route), CORRIDOR_M))
+    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
+    with ExitStack() as stack:
+        crowd = SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2])
+        stack.enter_context(crowd)
+        world = BulletWorld(street_map, scenario.place.seed, scenario.barriers, scenario.robot)
+        stack.enter_context(world)
+        camera = None
+        if manifest.camera is not None:
+            camera = stack.enter_context(BulletCamera(world, manifest.camera))
+        director = stack.enter_context(directed(scenario.id))
+        half_width_m = world.footprint_m[1] / 2
+        free = shapely.buffer(fenced(walkable, scenario.barriers), -half_width_m)
+        shapely.prepare(free)
+        parts = Parts(world, crowd, director, policy, camera, Limits(), free)
+        yield Stage(parts, WalkableArea(walkable), clock, "bullet-tiny" if camera else "none")
+
+
+@contextmanager
+def directed(env: str) -> Iterator[Director]:
+    """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
+    with ExitStack() as stack:
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cosim-zenoh-"))
+        endpoint = f"unixsock-stream/{folder}/hub.sock"
+        key = keys.director("local", keys.chunk(env))
+        serve_director(stack.enter_context(Session.hub(endpoint)), key, react)
+        yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
+
+
+def manifest_of(policy: Policy) -> Manifest:
+    """A policy's manifest. Raises PolicyError when it has none."""
+    manifest = getattr(policy, "manifest", None)
+    if not isinstance(manifest, Manifest):
+        raise PolicyError(f"{type(policy).__name__} has no 'manifest' that is a cosim.ports.Manifest")
+    return manifest
+
+
+@lru_cache(maxsize=1)
+def place(city: City) -> tuple[Path, StreetMap]:
+    """The net of a place and what was read from it; the last one is kept."""
+    path = city_net(city)
+    return path, read_net(path)
+
+
+@lru_cache(maxsize=1)
+def versions() -> dict[str, str]:
+    """Versions of everything that a state hash depends on."""
+    return {package: version(package) for package in PACKAGES}

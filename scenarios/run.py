@@ -1,0 +1,123 @@
+"""episode(spec, policy) -> record: the pure function that every worker runs."""
+
+from __future__ import annotations
+
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import msgspec
+
+from cosim.errors import CosimError
+from cosim.events import EventState
+from cosim.loop import steps
+from cosim.metrics import Episode, measure
+from cosim.ports import Policy
+from cosim.record import Log, Record, Recorder, TriggeredEvent
+from cosim.referee import Failure, Referee, Verdict
+from cosim.scenario import Scenario, content_hash
+from cosim.step import Step
+from scenarios.assemble import Stage, manifest_of, staged, versions
+
+PASSED_M = 5.0
+"""An event lies behind once the robot is this far beyond its place."""
+
+Watch = Callable[[Step, Verdict], None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came out of an episode. log: None if it crashed before the first tick; traceback: of a crash."""
+
+    record: Record
+    log: Log | None
+    traceback: str = ""
+
+
+def episode(scenario: Scenario, policy: Policy, *, suite_hash: str = "", watch: Watch | None = None) -> Outcome:
+    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`."""
+    began = time.perf_counter()
+    manifest = manifest_of(policy)
+    record = Record(
+        scenario=scenario.id,
+        scenario_hash=content_hash(scenario),
+        suite=scenario.suite,
+        suite_hash=suite_hash,
+        seed=scenario.seed,
+        policy=manifest.name,
+        policy_version=manifest.version,
+        goal_protocol="route" if manifest.privileged else "none",
+        renderer="none",
+        versions=versions(),
+        status="crashed",
+    )
+    try:
+        with staged(scenario, policy) as stage:
+            record = replaced(record, renderer=stage.renderer)
+            first_tick_s = time.perf_counter() - began
+            record, log = drive(record, scenario, stage, watch)
+    except Exception as error:  # noqa: BLE001  the one place where a failing episode is turned into its record
+        reason = str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
+        return Outcome(replaced(record, status="crashed", reason=reason), None, traceback.format_exc())
+    wall_s = time.perf_counter() - began
+    clock = {"wall_s": wall_s, "setup_s": first_tick_s}
+    return Outcome(replaced(record, clock=clock), log)
+
+
+def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None) -> tuple[Record, Log]:
+    """The episode itself, once every engine runs."""
+    referee = Referee(scenario, stage.area, stage.parts.world.footprint_m, stage.clock)
+    recorder = Recorder(stage.clock.tick_s)
+    failures: list[Failure] = []
+    red_lights: list[str] = []
+    run = steps(scenario, stage.clock, stage.parts)
+    step = next(run)
+    while True:
+        verdict = referee.judge(step)
+        recorder.add(step, verdict)
+        if verdict.failure is not None:
+            failures.append(verdict.failure)
+        if verdict.red_light_entry is not None:
+            red_lights.append(verdict.red_light_entry)
+        if watch is not None:
+            watch(step, verdict)
+        if verdict.ended is not None:
+            break
+        step = run.send(verdict.reset)
+    run.close()
+    log = recorder.log()
+    seen = Episode(log, tuple(failures), len(red_lights), verdict.ended, scenario.route_line.length_m)
+    done = replaced(
+        record,
+        status="done",
+        ended=verdict.ended,
+        ticks=len(log),
+        state_hash=recorder.hash.hexdigest(),
+        measures=measure(seen),
+        failures=tuple(failures),
+        events=events_of(scenario, step.events.states, float(log.route_s_m.max()), stage.clock.tick_ms),
+    )
+    return done, log
+
+
+def events_of(
+    scenario: Scenario, states: tuple[EventState, ...], furthest_m: float, tick_ms: int
+) -> tuple[TriggeredEvent, ...]:
+    """What became of the events of an episode."""
+    return tuple(
+        TriggeredEvent(
+            id=event.id,
+            kind=event.kind,
+            passed=furthest_m >= event.route_s_m + PASSED_M,
+            triggered_at_s=None if state.triggered_tick is None else state.triggered_tick * tick_ms / 1000,
+            trigger_distance_m=state.trigger_distance_m,
+        )
+        for event, state in zip(scenario.events, states, strict=True)
+    )
+
+
+def replaced(record: Record, **changes: Any) -> Record:
+    """The record with some fields changed."""
+    return msgspec.structs.replace(record, **changes)
