@@ -6,6 +6,8 @@ robot and the event pedestrians are mirrored in as proxies, so the crowd evades 
 
 from __future__ import annotations
 
+import os
+import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -125,20 +127,19 @@ class SumoCrowd(Crowd):
     def _launch(self, sumo_seed: int, begin_s: int) -> None:
         if not self._net_path.is_file():
             raise EngineError(f"no street net at {self._net_path}")
-        with tempfile.TemporaryDirectory(prefix="cosim-sumo-") as folder:
-            log = Path(folder) / "errors.txt"
-            try:
-                libsumo.start(_arguments(self._net_path, sumo_seed, begin_s, log))
-            except SUMO_ERRORS as error:
-                said = log.read_text(errors="replace") if log.is_file() else ""
-                with suppress(*SUMO_ERRORS):
-                    libsumo.close()
-                reason = " ".join([*said.split("\n"), str(error)]).strip()
-                raise EngineError(f"SUMO cannot start on {self._net_path}: {reason}") from error
+        said: list[str] = []
+        try:
+            with _stderr_into(said):
+                libsumo.start(_arguments(self._net_path, sumo_seed, begin_s))
+        except SUMO_ERRORS as error:
+            with suppress(*SUMO_ERRORS):
+                libsumo.close()
+            reason = " ".join("".join([*said, str(error)]).split())
+            raise EngineError(f"SUMO cannot start on {self._net_path}: {reason}") from error
 
     def _populate(self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator) -> None:
         x_m, y_m = self._start_xy
-        for kind, length_m, width_m, gap_m in (("robot", 1.0, 1.0, 0.5), ("event", 0.5, 0.6, 0.25)):
+        for kind, length_m, width_m, gap_m in (("robot", 1.0, 1.0, 0.5), ("event", 0.5, 0.8, 0.25)):
             libsumo.vehicletype.copy("DEFAULT_PEDTYPE", kind)
             libsumo.vehicletype.setLength(kind, length_m)
             libsumo.vehicletype.setWidth(kind, width_m)
@@ -219,7 +220,7 @@ class SumoCrowd(Crowd):
         return self._signals.is_red(libsumo.person.getNextEdge(person))
 
 
-def _arguments(net_path: Path, sumo_seed: int, begin_s: int, error_log: Path) -> list[str]:
+def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
     """SUMO's command line. Without jam times nobody squeezes through the robot; see the options' own help for more."""
     options: dict[str, object] = {
         "net-file": net_path,
@@ -238,9 +239,24 @@ def _arguments(net_path: Path, sumo_seed: int, begin_s: int, error_log: Path) ->
         "lanechange.duration": 2,
         "no-step-log": "true",
         "no-warnings": "true",
-        "error-log": error_log,
     }
     return ["sumo", *(word for name, value in options.items() for word in (f"--{name}", str(value)))]
+
+
+@contextmanager
+def _stderr_into(said: list[str]) -> Iterator[None]:
+    """Collect what is written to the process's stderr: libsumo prints there what its exceptions leave out."""
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as heard:
+        kept = os.dup(2)
+        os.dup2(heard.fileno(), 2)
+        try:
+            yield
+        finally:
+            os.dup2(kept, 2)
+            os.close(kept)
+            heard.seek(0)
+            said.append(heard.read().decode(errors="replace"))
 
 
 @contextmanager

@@ -38,7 +38,7 @@ def square() -> StreetMap:
         for end in (0, 1):
             corner = s.corners[end]
             if corner is not None:
-                ports.setdefault(corner, []).append(Port(s.id, end))  # type: ignore[arg-type]
+                ports.setdefault(corner, []).append(Port(s.id, end))
     corners = {c: Corner(c, box(0, 0, 1, 1), tuple(p)) for c, p in ports.items()}
     return StreetMap("square", (0, 0, 63, 90), {s.id: s for s in strips}, corners, {}, {})
 
