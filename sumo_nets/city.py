@@ -213,6 +213,7 @@ def _remove(draft: _Draft, rng: np.random.Generator, share: float) -> None:
     for link in draft.links:
         neighbours[link.a].add(link.b)
         neighbours[link.b].add(link.a)
+    slanting = {end for link in draft.links if link.turns != (0.0, 0.0) for end in (link.a, link.b)}
     wanted = round(share * len(draft.links))
     gone: set[tuple[Cell, Cell]] = set()
     for k in rng.permutation(len(draft.links)).tolist():
@@ -226,7 +227,7 @@ def _remove(draft: _Draft, rng: np.random.Generator, share: float) -> None:
         # Two arms make one longer street: rarely, and never two such points in a row.
         if any(len(neighbours[near]) < 3 for end in thin for near in neighbours[end]) or len(thin) == 2:
             continue
-        if thin and rng.random() > 0.3:
+        if thin and (slanting & set(thin) or rng.random() > 0.3):
             continue
         neighbours[link.a].discard(link.b)
         neighbours[link.b].discard(link.a)
@@ -358,9 +359,11 @@ def _emit(
         tail, head = joints[link.a, number], joints[link.b, number]
         line, name = _line(draft, link, tail.at, head.at), f"s{number}"
         draws = rng.random(3).tolist()
-        blocked = sum(14.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
-        if length(line) > 96.0 + blocked and draws[0] < crosswalks:
-            first, second = split(line, (0.45 + 0.1 * draws[1]) * length(line))
+        blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
+        if length(line) > (106.0 if link.via is None else 180.0) + blocked and draws[0] < crosswalks:
+            # Well before the corner of a street that has one.
+            where = 0.45 + 0.1 * draws[1] if link.via is None else 0.27
+            first, second = split(line, where * length(line))
             busy = CLASSES[link.street_class].lanes > 1
             middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if busy else 0.25))
             nodes[middle.id] = middle

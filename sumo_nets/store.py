@@ -14,7 +14,7 @@ from sumo_nets.city import CityPlan, Edge, plan_city
 from sumo_nets.netfile import net_content_hash, netconvert, without_comments
 from sumo_nets.signals import with_programs
 
-GENERATOR = 1
+GENERATOR = 3
 """Version of the generator: another one for every change that changes a net."""
 CROSSING_M = 3.2
 NETCONVERT = (
