@@ -78,7 +78,9 @@ def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Float
     i, j = i[seen], j[seen]
     lengths = np.hypot(*(nodes[i] - nodes[j]).T)
     graph = csr_array((lengths, (i, j)), shape=(len(nodes), len(nodes)))
-    distance, before = dijkstra(graph, directed=False, indices=0, return_predecessors=True)
+    distance, before = dijkstra(  # type: ignore[call-overload]
+        graph, directed=False, indices=0, return_predecessors=True
+    )
     if not np.isfinite(distance[1]):
         return None
     path = [1]

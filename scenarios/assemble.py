@@ -11,6 +11,7 @@ from importlib.metadata import version
 from pathlib import Path
 
 import shapely
+from physics.camera import BulletCamera
 from shapely.geometry import LineString
 
 from bridge import keys
@@ -23,7 +24,6 @@ from cosim.loop import Parts
 from cosim.ports import Director, Manifest, Policy
 from cosim.scenario import City, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
-from physics.camera import BulletCamera
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react

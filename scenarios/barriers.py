@@ -73,7 +73,10 @@ def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
 def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon | MultiPolygon:
     """The walkable area minus the ground of the barriers."""
     fences = [outline(barrier) for barrier in barriers]
-    return shapely.difference(area, shapely.union_all(np.array(fences, dtype=object))) if fences else area
+    if not fences:
+        return area
+    open_area: Polygon | MultiPolygon = shapely.difference(area, shapely.union_all(np.array(fences, dtype=object)))
+    return open_area
 
 
 def prove_single_path(

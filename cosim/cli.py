@@ -1,0 +1,274 @@
+"""The command line: `cosim run`, `list`, `show`, `doctor`."""
+
+from __future__ import annotations
+
+import sys
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import pandas as pd
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from cosim.errors import CosimError, UsageError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
+)
+out = Console()
+err = Console(stderr=True)
+
+SHOWN = (
+    ("success", "SR"),
+    ("route_completion", "RC"),
+    ("failures_per_100m", "FC /100m"),
+    ("collisions_per_100m", "C"),
+    ("out_of_lane_per_100m", "OL"),
+    ("freezings_per_100m", "F"),
+    ("velocity_mean_mps", "V m/s"),
+)
+COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
+
+
+@app.command(
+    epilog="Examples:  \n"
+    "`cosim run long-horizon --policy route --episodes 2`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`"
+)
+def run(
+    suite: Annotated[str, typer.Argument(help="A suite; `cosim list` shows them.")],
+    policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
+    scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
+    frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
+) -> None:
+    """Run a suite with a policy and print its table."""
+    from cosim.policies.load import load_policy
+    from cosim.runfolder import RunFolder, RunSpec
+    from scenarios.assemble import manifest_of, versions
+    from scenarios.catalog import chosen
+    from scenarios.catalog import suite as shipped
+    from scenarios.pool import run_all
+
+    whole = shipped(suite)
+    picked = chosen(whole, scenario or (), episodes)
+    manifest = manifest_of(load_policy(policy))
+    spec = RunSpec(
+        suite=whole.name,
+        suite_version=whole.version,
+        suite_hash=whole.content_hash,
+        policy=policy,
+        policy_name=manifest.name,
+        policy_version=manifest.version,
+        scenarios=tuple(s.id for s in picked),
+        versions=versions(),
+    )
+    if resume and folder is None:
+        raise UsageError("--resume needs --out: the folder of the run to finish")
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = folder or Path("runs") / f"{suite}-{manifest.name}-{stamp}"
+    held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
+    with held:
+        done = held.finished()
+        todo = [s for s in picked if s.id not in done]
+        if done:
+            err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
+        board = Board(len(picked), len(done), {s.id: s.route_line.length_m for s in picked})
+        try:
+            with board.bars:
+                run_all(held, todo, policy, manifest, jobs=jobs, tell=board.tell, frames_every_s=frames)
+        except KeyboardInterrupt:
+            finished = len(held.finished())
+            again = " ".join(a for a in sys.argv[1:] if a != "--resume")
+            again += "" if folder else f" --out {path}"
+            err.print(f"Stopped. {finished} of {len(picked)} episodes are finished and kept in {path}.")
+            err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
+            raise typer.Exit(130) from None
+        table = held.finish()
+    print_table(table, len(picked))
+    out.print(f"Run folder: {path}", soft_wrap=True)
+
+
+@app.command("list")
+def list_all(
+    suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
+) -> None:
+    """List the suites and policies, or the scenarios of a suite."""
+    from cosim.policies import POLICIES
+    from scenarios.catalog import SUITES
+    from scenarios.catalog import suite as shipped
+
+    if suite is None:
+        for name in SUITES:
+            whole = shipped(name)
+            out.print(
+                f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}"
+            )
+        for name, make in POLICIES.items():
+            out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+        return
+    table = Table("scenario", "place", "route m", "crossings", "events", "barriers", "time limit s")
+    for s in shipped(suite).scenarios:
+        cells = (f"{s.route_line.length_m:.0f}", len(s.crossings), len(s.events), len(s.barriers), s.time_limit_s)
+        table.add_row(s.id, s.place.name, *(f"{c:g}" if isinstance(c, float) else str(c) for c in cells))
+    out.print(table)
+
+
+@app.command(epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --episode lh-011-00 -o episode.png`")
+def show(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str | None, typer.Option(help="One episode: its failures and events, and a picture.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Where to write the episode's picture.")
+    ] = None,
+) -> None:
+    """Show the table of a run, finished or not, or one episode as a picture from above."""
+    from cosim.results import table_of
+    from cosim.runfolder import read_records, read_spec
+
+    spec = read_spec(folder)
+    records = {record.scenario: record for record in read_records(folder)}
+    if episode is None:
+        print_table(table_of(records.values()), len(spec.scenarios))
+        return
+    if episode not in records:
+        from cosim.errors import unknown
+
+        raise unknown(f"finished episode in {folder}", episode, records)
+    from scenarios.picture import draw_episode
+
+    record = records[episode]
+    print_episode(record)
+    if record.status == "done":
+        path = picture or folder / "episodes" / episode / "above.png"
+        draw_episode(folder, episode, path)
+        out.print(f"Picture: {path}", soft_wrap=True)
+
+
+@app.command()
+def doctor() -> None:
+    """Check that every engine works here: versions, a frame, a query, a step."""
+    from scenarios.checks import CHECKS
+
+    failed = 0
+    for name, check in CHECKS.items():
+        try:
+            out.print(f"[green]ok[/]      {name}: {check()}", soft_wrap=True)
+        except Exception as error:  # noqa: BLE001  a check may fail in any way; it is shown and counted
+            failed += 1
+            out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {error}", soft_wrap=True)
+    if failed:
+        raise typer.Exit(1)
+
+
+class Board:
+    """The progress display of a run: one bar for the suite, one for each episode under way."""
+
+    def __init__(self, total: int, done: int, lengths_m: dict[str, float]) -> None:
+        self.bars = Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("{task.fields[note]}"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=err,
+        )
+        self._lengths_m = lengths_m
+        self._all = self.bars.add_task("episodes", total=total, completed=done, note="")
+        self._tasks: dict[str, int] = {}
+
+    def tell(self, message: object) -> None:
+        """Take in what a worker says."""
+        from scenarios.worker import Done
+        from scenarios.worker import Progress as Report
+
+        if isinstance(message, Report):
+            task = self._tasks.get(message.scenario)
+            if task is None:
+                length_m = round(self._lengths_m[message.scenario])
+                task = self.bars.add_task(f"  {message.scenario}", total=length_m, note="")
+                self._tasks[message.scenario] = task
+            note = f"m  {message.time_s:.0f} s simulated, {message.failures} failures"
+            self.bars.update(task, completed=round(message.route_s_m), note=note)
+        elif isinstance(message, Done):
+            task = self._tasks.pop(message.scenario, None)
+            if task is not None:
+                self.bars.remove_task(task)  # type: ignore[arg-type]
+            self.bars.advance(self._all)
+            err.print(f"{message.scenario}: {message.status}")
+
+
+def print_table(table: pd.DataFrame, scheduled: int) -> None:
+    """The table of a run: a row per episode, then the means with their intervals."""
+    from cosim.results import summary_of
+
+    shown = Table("episode", "ended", *(head for _, head in SHOWN), "events C/OL/F", "hash")
+    for _, row in table.iterrows():
+        counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
+        ended = row["ended"] if row["status"] == "done" else row["status"]
+        cells = ("-" if pd.isna(row[name]) else f"{row[name]:.2f}" for name, _ in SHOWN)
+        shown.add_row(row["scenario"], ended, *cells, counts, str(row["state_hash"])[:8])
+    if len(table):
+        summary = summary_of(table, [name for name, _ in SHOWN])
+        shown.add_section()
+        shown.add_row("mean", "", *(_cell(row["mean"]) for _, row in summary.iterrows()))
+        intervals = (f"{_cell(r['low'])}-{_cell(r['high'])}" if r["n"] else "-" for _, r in summary.iterrows())
+        shown.add_row("95 %", "", *intervals)
+        shown.add_row("n", "", *(f"{row['n']:.0f}" for _, row in summary.iterrows()))
+    out.print(shown)
+    crashed = table[table["status"] == "crashed"]
+    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}")
+    for _, row in crashed.iterrows():
+        out.print(f"crashed {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_episode(record: object) -> None:
+    """One episode in words: how it ended, every failure, every event, every metric."""
+    from cosim.metrics import METRICS
+    from cosim.record import Record
+
+    assert isinstance(record, Record)
+    out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
+    for failure in record.failures:
+        what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
+        fault = f", {failure.fault}" if failure.fault else ""
+        out.print(f"  {failure.tick * 0.05:7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
+    for event in record.events:
+        at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
+        out.print(f"  event {event.id} {event.kind}: {at}")
+    table = Table("metric", "value", "unit")
+    for name, metric in METRICS.items():
+        table.add_row(name, _cell(record.measures.get(name)), metric.unit)
+    out.print(table)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None or pd.isna(value) else f"{value:.2f}"
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    try:
+        app()
+    except UsageError as error:
+        err.print(f"[red]error:[/] {error}", soft_wrap=True, highlight=False)
+        raise SystemExit(2) from None
+    except CosimError as error:
+        err.print(f"[red]error:[/] {error}", soft_wrap=True, highlight=False)
+        raise SystemExit(1) from None
+
+
+if __name__ == "__main__":
+    main()

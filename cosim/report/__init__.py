@@ -1,0 +1,1 @@
+"""Results for eyes: pictures of episodes."""

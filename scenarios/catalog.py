@@ -1,0 +1,31 @@
+"""SUITES: what ships with the project, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+
+from cosim.errors import unknown
+from cosim.scenario import Scenario, Suite, read_suite
+
+_HERE = Path(__file__).parent / "suites"
+
+SUITES: Mapping[str, Path] = MappingProxyType({"long-horizon": _HERE / "long-horizon.json"})
+
+
+def suite(name: str) -> Suite:
+    """A shipped suite. Raises UsageError with the valid names."""
+    if name not in SUITES:
+        raise unknown("suite", name, SUITES)
+    return read_suite(SUITES[name])
+
+
+def chosen(whole: Suite, ids: Sequence[str] = (), episodes: int | None = None) -> tuple[Scenario, ...]:
+    """The named scenarios of a suite (all when none is named), the first `episodes` of them."""
+    by_id = {scenario.id: scenario for scenario in whole.scenarios}
+    for scenario_id in ids:
+        if scenario_id not in by_id:
+            raise unknown("scenario", scenario_id, by_id)
+    picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
+    return tuple(picked[:episodes])

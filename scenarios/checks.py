@@ -1,0 +1,85 @@
+"""What `cosim doctor` checks: every engine does something real."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Mapping
+from importlib.metadata import packages_distributions
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from cosim.errors import CosimError
+from cosim.events import EventQuery
+from cosim.policies.baselines import Straight
+from cosim.scenario import City, CrowdSpec, Scenario
+from cosim.walks import WalkGraph
+from scenarios.assemble import directed, place, staged, versions
+from scenarios.long_horizon import build
+from sumo_nets.store import cache_folder
+
+SMALL = City(seed=1, size_m=500.0)
+OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+
+
+def packages() -> str:
+    return ", ".join(f"{name} {version}" for name, version in versions().items())
+
+
+def names() -> str:
+    """The top-level packages are ours and not another distribution's of the same name."""
+    owners = packages_distributions()
+    for name in OWN:
+        if (owner := set(owners.get(name, ["sidewalk-cosim"]))) != {"sidewalk-cosim"}:
+            raise CosimError(f"package '{name}' belongs to {', '.join(sorted(owner))}: use a virtual environment")
+    return f"{', '.join(OWN)} are this project's"
+
+
+def cache() -> str:
+    folder = cache_folder()
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.NamedTemporaryFile(dir=folder):
+        return f"{folder} can be written"
+
+
+def city() -> str:
+    net, street_map = place(SMALL)
+    return f"netconvert built {Path(net).name}: {len(street_map.strips)} strips, {len(street_map.corners)} corners"
+
+
+def bridge() -> str:
+    query = EventQuery(
+        episode="doctor", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0,
+        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, events=(),
+    )  # fmt: skip
+    with directed("doctor") as director:
+        director.react(query)
+    return "a director answered over a Zenoh session"
+
+
+def frame() -> str:
+    """One frame and one step of a small city, with crowd and physics."""
+    scenario = small_scenario()
+    with staged(scenario, Straight()) as stage:
+        parts = stage.parts
+        robot = parts.world.place(scenario.start_pose)
+        assert parts.camera is not None
+        picture = parts.camera.render(robot, parts.crowd.street)
+        if len(np.unique(picture.rgb.reshape(-1, 3), axis=0)) < 5:
+            raise CosimError("the camera's picture is blank")
+        height, width, _ = picture.rgb.shape
+        return f"SUMO walks {len(parts.crowd.street.people)} people, PyBullet draws {width}x{height}"
+
+
+def small_scenario() -> Scenario:
+    """A long-horizon scenario in a small city with a small crowd."""
+    _, street_map = place(SMALL)
+    scenario = build(SMALL, street_map, WalkGraph(street_map), 0, "doctor")
+    fields = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
+    return Scenario(**fields | {"crowd": CrowdSpec(persons=10, radius_m=50.0, vehicles=4)})
+
+
+CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
+    {"packages": packages, "names": names, "cache": cache, "city": city, "bridge": bridge, "frame": frame}
+)

@@ -1,0 +1,198 @@
+"""Runs scenarios in N environment processes on this machine.
+
+A process that dies (SUMO and PyBullet can take it down) is replaced and its scenario tried once more; one that shows
+no sign of life is killed. After the last attempt the episode is recorded as crashed, so that none is ever lost.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from multiprocessing.connection import Connection, wait
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+
+from cosim.ports import Manifest
+from cosim.record import Record
+from cosim.runfolder import RunFolder
+from cosim.scenario import Scenario, content_hash
+from scenarios import worker
+from scenarios.assemble import versions
+from scenarios.worker import Done, Job, Message, Progress
+
+ATTEMPTS = 2
+SILENCE_S = 300.0
+"""A worker that says nothing for so long hangs; a slow policy says something once a simulated second."""
+
+POLL_S = 1.0
+LOG_TAIL = 400
+
+Tell = Callable[[Message], None]
+
+
+@dataclass
+class _Worker:
+    """A worker process, its end of the pipe, and what it is busy with."""
+
+    process: SpawnProcess
+    pipe: Connection
+    log: Path
+    job: Scenario | None = None
+    heard_at: float = field(default_factory=time.monotonic)
+
+
+def run_all(
+    folder: RunFolder,
+    scenarios: Sequence[Scenario],
+    policy: str,
+    manifest: Manifest,
+    *,
+    jobs: int,
+    tell: Tell,
+    frames_every_s: float = 0.0,
+) -> None:
+    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends."""
+    pool = _Pool(folder, policy, manifest, tell, frames_every_s)
+    waiting = deque(scenarios)
+    attempts = dict.fromkeys((s.id for s in scenarios), 0)
+    try:
+        while waiting or pool.busy:
+            while waiting and len(pool.busy) < jobs:
+                pool.give(waiting.popleft())
+            for scenario, why in pool.listen():
+                attempts[scenario.id] += 1
+                if attempts[scenario.id] < ATTEMPTS:
+                    waiting.appendleft(scenario)
+                else:
+                    pool.give_up(scenario, f"{why}, {ATTEMPTS} times")
+    finally:
+        pool.close()
+
+
+class _Pool:
+    """The workers of one run."""
+
+    def __init__(self, folder: RunFolder, policy: str, manifest: Manifest, tell: Tell, frames_every_s: float) -> None:
+        self._folder, self._policy, self._manifest = folder, policy, manifest
+        self._tell, self._frames_every_s = tell, frames_every_s
+        self._workers: list[_Worker] = []
+        self._started = 0
+
+    @property
+    def busy(self) -> list[_Worker]:
+        return [w for w in self._workers if w.job is not None]
+
+    def give(self, scenario: Scenario) -> None:
+        """Hand a scenario to an idle worker, or to a new one."""
+        idle = next((w for w in self._workers if w.job is None), None) or self._start()
+        idle.job, idle.heard_at = scenario, time.monotonic()
+        target = str(self._folder.episode_folder(scenario.id))
+        try:
+            idle.pipe.send_bytes(
+                worker.encode(Job(scenario, self._folder.spec.suite_hash, target, self._frames_every_s))
+            )
+        except BrokenPipeError:
+            idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out
+
+    def listen(self) -> list[tuple[Scenario, str]]:
+        """Take in what the workers say. Returns the scenarios whose worker was lost, and why."""
+        lost = []
+        wait([w.pipe for w in self.busy], timeout=POLL_S)
+        for one in self.busy:
+            if self._hear(one):
+                continue
+            why = self._death(one)
+            if why is not None and one.job is not None:
+                self._workers.remove(one)
+                lost.append((one.job, why))
+        return lost
+
+    def _hear(self, one: _Worker) -> bool:
+        """Everything a worker has said since; False when its pipe is closed or it has been silent."""
+        try:
+            while one.pipe.poll():
+                message = worker.decode_message(one.pipe.recv_bytes())
+                one.heard_at = time.monotonic()
+                if isinstance(message, Done):
+                    self._folder.add(Record.load(self._folder.episode_folder(message.scenario) / "record.json"))
+                    one.job = None
+                self._tell(message)
+        except (EOFError, ConnectionResetError):
+            one.process.join(5.0)
+            return False
+        return one.job is None or time.monotonic() - one.heard_at < SILENCE_S
+
+    def _death(self, one: _Worker) -> str | None:
+        """How a worker ended; a hanging one is killed."""
+        if one.process.is_alive():
+            one.process.kill()
+            one.process.join()
+            return f"no sign of life for {SILENCE_S:g} s"
+        one.pipe.close()
+        code = one.process.exitcode or 0
+        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        return f"the environment process was {how}{_last_words(one.log)}"
+
+    def give_up(self, scenario: Scenario, reason: str) -> None:
+        """Record a scenario that no worker survives as crashed."""
+        record = Record(
+            scenario=scenario.id,
+            scenario_hash=content_hash(scenario),
+            suite=scenario.suite,
+            suite_hash=self._folder.spec.suite_hash,
+            seed=scenario.seed,
+            policy=self._manifest.name,
+            policy_version=self._manifest.version,
+            goal_protocol="route" if self._manifest.privileged else "none",
+            renderer="none",
+            versions=versions(),
+            status="crashed",
+            reason=reason,
+        )
+        target = self._folder.episode_folder(scenario.id)
+        target.mkdir(parents=True, exist_ok=True)
+        record.save(target / "record.json")
+        self._folder.add(record)
+        self._tell(Done(scenario.id, "crashed"))
+
+    def close(self) -> None:
+        """End every worker: idle ones by closing their pipe, busy ones by force."""
+        for one in self._workers:
+            if one.job is not None:
+                one.process.kill()
+            one.pipe.close()
+        for one in self._workers:
+            one.process.join(10.0)
+            if one.process.is_alive():
+                one.process.kill()
+                one.process.join()
+        self._workers.clear()
+
+    def _start(self) -> _Worker:
+        context = multiprocessing.get_context("spawn")
+        mine, theirs = context.Pipe()
+        log = self._folder.path / "logs" / f"worker-{self._started}.log"
+        process = context.Process(
+            target=worker.main, args=(theirs, self._policy, str(log)), name=f"cosim-env-{self._started}", daemon=True
+        )
+        process.start()
+        theirs.close()
+        self._started += 1
+        one = _Worker(process, mine, log)
+        self._workers.append(one)
+        return one
+
+
+def _last_words(log: Path) -> str:
+    """The end of a worker's log, to be put behind a reason."""
+    if not log.exists():
+        return ""
+    said = log.read_text(errors="replace").strip()[-LOG_TAIL:].strip()
+    return f"; it last printed: {said}" if said else ""
+
+
+__all__ = ["Progress", "run_all"]

@@ -1,0 +1,115 @@
+"""One environment process: takes scenarios over a pipe, runs them, leaves their files, reports.
+
+Spawned, never forked. It dies with its parent; what the engines print goes to its log.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import shutil
+import signal
+import sys
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Literal
+
+import cv2
+import msgspec
+
+from cosim.policies.load import load_policy
+from cosim.referee import Verdict
+from cosim.scenario import Scenario
+from cosim.step import Step
+from scenarios.run import Watch, episode
+
+REPORT_EVERY_TICKS = 20
+PR_SET_PDEATHSIG = 1
+
+
+class Job(msgspec.Struct, frozen=True, tag=True):
+    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames."""
+
+    scenario: Scenario
+    suite_hash: str
+    folder: str
+    frames_every_s: float = 0.0
+
+
+class Progress(msgspec.Struct, frozen=True, tag=True):
+    """A sign of life: how far the episode is."""
+
+    scenario: str
+    time_s: float
+    route_s_m: float
+    failures: int
+
+
+class Done(msgspec.Struct, frozen=True, tag=True):
+    """The episode is over and its record is on disk."""
+
+    scenario: str
+    status: Literal["done", "crashed"]
+
+
+Message = Progress | Done
+
+encode = msgspec.msgpack.Encoder().encode
+decode_job = msgspec.msgpack.Decoder(Job).decode
+decode_message = msgspec.msgpack.Decoder(Message).decode
+
+
+def main(pipe: Connection, policy: str, log_path: str) -> None:
+    """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew."""
+    die_with_parent()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with Path(log_path).open("ab", buffering=0) as log:
+        os.dup2(log.fileno(), 1)
+        os.dup2(log.fileno(), 2)
+    driver = load_policy(policy)
+    while True:
+        try:
+            job = decode_job(pipe.recv_bytes())
+        except EOFError:
+            return
+        outcome = episode(job.scenario, driver, suite_hash=job.suite_hash, watch=watcher(job, pipe))
+        if outcome.traceback:
+            print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
+            driver = load_policy(policy)
+        folder = Path(job.folder)
+        folder.mkdir(parents=True, exist_ok=True)
+        if outcome.log is not None:
+            outcome.log.save(folder / "trajectory.npz")
+        outcome.record.save(folder / "record.json")
+        pipe.send_bytes(encode(Done(job.scenario.id, outcome.record.status)))
+
+
+def watcher(job: Job, pipe: Connection) -> Watch:
+    """Reports progress, and keeps camera frames where the job asks for them."""
+    failures = 0
+    next_frame_s = 0.0
+    frames = Path(job.folder) / "frames"
+    if job.frames_every_s:
+        shutil.rmtree(frames, ignore_errors=True)
+        frames.mkdir(parents=True)
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        nonlocal failures, next_frame_s
+        failures += verdict.failure is not None
+        time_s = step.tick * 0.05
+        if step.frame is not None and job.frames_every_s and time_s >= next_frame_s:
+            next_frame_s += job.frames_every_s
+            cv2.imwrite(str(frames / f"{step.tick:06d}.png"), step.frame.rgb[..., ::-1])
+        if step.tick % REPORT_EVERY_TICKS == 0:
+            pipe.send_bytes(encode(Progress(job.scenario.id, time_s, step.route_s_after_m, failures)))
+
+    return watch
+
+
+def die_with_parent() -> None:
+    """Ask Linux to kill this process when its parent dies, however that happens."""
+    if sys.platform == "linux":
+        parent = os.getppid()
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:
+            os._exit(1)
