@@ -6,16 +6,18 @@ kind draws from its own generator; ids are "c<n>" and "v<n>".
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from cosim.geometry import Floats, Polyline
+from cosim.geometry import Floats, Polyline, Pose, heading_to_sumo
 from cosim.scenario import CrowdSpec
 from cosim.streetmap import Port, StreetMap
 from cosim.walks import WalkGraph
+from sumo_nets.proxy import END_M, KEEP_ROUTE, MATCH_M
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
@@ -29,10 +31,11 @@ LINGER_M = 40.0
 STUCK_S = 60.0
 """A person that has waited this long, but not at a red light, is taken out."""
 
+EDGE_M = 0.4
 PERSON_MPS = (1.1, 1.65)
 PERSONAL_SPACE_M = 1.5
 WALK_EDGES = 30
-BARRIER_MARGIN_M = 3.0
+BARRIER_MARGIN_M = 1.0
 PERSONS_AT_ONCE = 8
 
 VEHICLE_RING_M = (60.0, 220.0)
@@ -60,12 +63,16 @@ class Seen(NamedTuple):
 
 
 class Spot(NamedTuple):
-    """A point on an edge: its arc length as a share of the edge's length."""
+    """A place on the middle line of an edge, heading along it; share: of the edge's length that lies before it."""
 
     edge: str
     share: float
-    x_m: float
-    y_m: float
+    pose: Pose
+
+
+def shifted(pose: Pose, left_m: float) -> tuple[float, float]:
+    """The point `left_m` to the left of a pose."""
+    return pose.x_m - left_m * math.sin(pose.heading_rad), pose.y_m + left_m * math.cos(pose.heading_rad)
 
 
 class Spots:
@@ -75,27 +82,27 @@ class Spots:
         """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in metres."""
         self._edges: list[str] = []
         shares: list[Floats] = [np.zeros(0)]
-        points: list[Floats] = [np.zeros((0, 2))]
+        poses: list[Floats] = [np.zeros((0, 3))]
         for edge, xy, start_m, end_m in lines:
             line = Polyline(xy)
             s = np.arange(start_m, line.length_m - end_m, step_m)
+            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
             self._edges += [edge] * len(s)
             shares.append(s / line.length_m)
-            points.append(np.column_stack([np.interp(s, line.s_m, line.points[:, k]) for k in (0, 1)]))
+            poses.append(np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])]))
         self._shares = np.concatenate(shares)
-        self._xy = np.concatenate(points)
-        self._tree = cKDTree(self._xy)
+        self._poses = np.concatenate(poses)
+        self._tree = cKDTree(self._poses[:, :2])
 
     def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[int]:
         """The numbers of the spots at a distance in [low_m, high_m)."""
         hits = np.array(self._tree.query_ball_point((x_m, y_m), high_m, return_sorted=True), dtype=np.intp)
-        gap = self._xy[hits] - (x_m, y_m)
+        gap = self._poses[hits, :2] - (x_m, y_m)
         near: list[int] = hits[np.hypot(gap[:, 0], gap[:, 1]) >= low_m].tolist()
         return near
 
     def __getitem__(self, number: int) -> Spot:
-        x, y = self._xy[number].tolist()
-        return Spot(self._edges[number], float(self._shares[number]), x, y)
+        return Spot(self._edges[number], float(self._shares[number]), Pose(*self._poses[number].tolist()))
 
 
 class Pedestrians:
@@ -106,6 +113,7 @@ class Pedestrians:
     ) -> None:
         self._engine, self._spec, self._rng, self._closed = engine, spec, rng, closed
         self._graph = WalkGraph(street_map)
+        self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
         self._spots = Spots(
             (
                 (s.id, s.line, self._margin_m(Port(s.id, 0)), self._margin_m(Port(s.id, 1)))
@@ -137,7 +145,7 @@ class Pedestrians:
         self._enter(min(self._spec.persons - int(inside), PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _margin_m(self, port: Port) -> float:
-        return BARRIER_MARGIN_M if port in self._closed else 0.5
+        return self._widths_m[port.strip] + END_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
 
     def _enter(self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]) -> None:
         if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
@@ -146,23 +154,27 @@ class Pedestrians:
         for _ in range(4 * count):
             spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
             forward, speed_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*PERSON_MPS))
-            if any(np.hypot(spot.x_m - x, spot.y_m - y) < PERSONAL_SPACE_M for x, y in taken):
+            half_m = max(self._widths_m[spot.edge] / 2 - EDGE_M, 0.0)
+            x, y = shifted(spot.pose, float(self._rng.uniform(-half_m, half_m)))
+            if any(np.hypot(x - other_x, y - other_y) < PERSONAL_SPACE_M for other_x, other_y in taken):
                 continue
             walk = self._graph.wander(self._rng, spot.edge, forward, WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
-            self._add(spot, walk, speed_mps)
-            taken.append((spot.x_m, spot.y_m))
+            self._add(spot, walk, speed_mps, (x, y))
+            taken.append((x, y))
             count -= 1
             if count == 0:
                 return
 
-    def _add(self, spot: Spot, walk: list[str], speed_mps: float) -> None:
+    def _add(self, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
+        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
         name = f"c{self._count}"
         self._count += 1
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
         self._engine.person.add(name, spot.edge, spot.share * first_m)
         self._engine.person.appendWalkingStage(name, walk, last_m / 2, speed=speed_mps)
+        self._engine.person.moveToXY(name, "", *xy, heading_to_sumo(spot.pose.heading_rad), KEEP_ROUTE, MATCH_M)
 
 
 class Drivers:
