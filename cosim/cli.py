@@ -10,7 +10,15 @@ from typing import Annotated
 import pandas as pd
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 from rich.table import Table
 
 from cosim.errors import CosimError, UsageError
@@ -187,7 +195,7 @@ class Board:
         )
         self._lengths_m = lengths_m
         self._all = self.bars.add_task("episodes", total=total, completed=done, note="")
-        self._tasks: dict[str, int] = {}
+        self._tasks: dict[str, TaskID] = {}
 
     def tell(self, message: object) -> None:
         """Take in what a worker says."""
@@ -205,7 +213,7 @@ class Board:
         elif isinstance(message, Done):
             task = self._tasks.pop(message.scenario, None)
             if task is not None:
-                self.bars.remove_task(task)  # type: ignore[arg-type]
+                self.bars.remove_task(task)
             self.bars.advance(self._all)
             err.print(f"{message.scenario}: {message.status}")
 

@@ -134,8 +134,7 @@ class StreetMap:
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
         """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there are none."""
-        pieces: list[Piece] = [*self.near("strip", area), *self.near("corner", area)]
-        polygons = [piece.polygon for piece in pieces]
+        polygons = [piece.polygon for piece in self.near("strip", area) + self.near("corner", area)]
         if not polygons:
             raise MapError(f"nothing walkable near {shapely.centroid(area).wkt} on map '{self.name}'")
         return union_closed(polygons)

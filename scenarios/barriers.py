@@ -75,8 +75,7 @@ def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon
     fences = [outline(barrier) for barrier in barriers]
     if not fences:
         return area
-    open_area: Polygon | MultiPolygon = shapely.difference(area, shapely.union_all(np.array(fences, dtype=object)))
-    return open_area
+    return shapely.difference(area, shapely.union_all(np.array(fences, dtype=object)))  # type: ignore[return-value]
 
 
 def prove_single_path(

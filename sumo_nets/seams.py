@@ -16,7 +16,7 @@ from shapely.geometry import Polygon
 
 from cosim.geometry import Floats
 
-REACH_M = 0.6
+REACH_M = 2.5
 """How far beyond its end a strip may look for its corner."""
 
 Polygons = NDArray[np.object_]

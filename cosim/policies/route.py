@@ -1,7 +1,7 @@
 """`route`: the privileged baseline. Follows the reference route, waits at red, yields to people and cars.
 
-A few lanes beside the route are compared: on each, how fast may one drive so that no one's predicted path (constant
-velocity) comes nearer than a clearance? The best lane is followed with a PD controller on the bearing of a point
+A few lanes beside the route are compared at a few speeds: a plan is good if nobody's predicted path (constant
+velocity) comes nearer than a clearance. The best lane is followed with a PD controller on the bearing of a point
 ahead; signals and gaps in traffic limit the speed before crossings.
 """
 
@@ -17,11 +17,14 @@ from cosim.ports import Manifest, Observation, Privileged
 from cosim.state import PERSON_RADIUS_M, Command
 
 CRUISE_MPS = 1.5
-SPEEDS_MPS = np.array([1.5, 1.1, 0.7, 0.35])
+SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])
+"""Speeds that are compared, the last one waiting."""
+
 OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
-AHEAD_M = np.linspace(0.3, 4.8, 16)
-SHIFT_M_PER_M = 0.45
-"""Sideways metres per metre driven, at most, when changing lanes."""
+TIMES_S = np.linspace(0.25, 3.5, 14)
+SHIFT_M_PER_M = 0.4
+SHIFT_AFTER_M = 0.2
+"""Changing lanes: sideways metres per metre driven, and metres until it begins to show."""
 
 LOOK_AHEAD_M = 1.4
 GAIN_P_PER_S = 1.5
@@ -38,7 +41,7 @@ BODY_RADIUS_M = 0.33
 
 CLEARANCE_M = 0.25
 PATIENCE_S = 3.0
-SEEN_M = 9.0
+SEEN_M = 11.0
 
 
 class Route:
@@ -120,24 +123,24 @@ def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
 
 
 def best_lane(known: Privileged, current_m: float, clearance_m: float) -> tuple[float, float]:
-    """(offset, speed): the lane beside the route worth taking and the speed that is safe on it.
+    """(offset, speed): the lane beside the route worth taking and the speed to drive on it, 0 to wait.
 
-    Every lane is a path of AHEAD_M points that shifts from where the robot is to the lane. A speed is safe when no
-    predicted disk comes nearer than `clearance_m` to the body while driving it for the horizon.
+    Of the plans that keep `clearance_m` from everyone, the fastest on the nearest lane; when none does, not even
+    waiting, the one that keeps farthest away.
     """
     centres, velocities, radii = obstacles(known)
     if not len(centres):
         return 0.0, CRUISE_MPS
-    paths, headings = lane_paths(known.route, known.route_s_m, lateral_of(known))
-    speeds = safe_speeds(paths, headings, centres, velocities, radii, clearance_m)
-    inside = shapely.contains_xy(known.free, paths[..., 0], paths[..., 1])
-    inside[0] = True
-    speeds = np.where(inside.all(axis=1), speeds, -1.0)
-    score = speeds - 0.25 * np.abs(OFFSETS_M) - 0.3 * np.abs(OFFSETS_M - current_m)
-    best = int(np.argmax(np.where(speeds >= 0.0, score, -np.inf)))
-    if speeds[best] <= 0.0:
-        return current_m, 0.0
-    return float(OFFSETS_M[best]), float(speeds[best])
+    paths = plans(known.route, known.route_s_m, lateral_of(known))
+    gaps = smallest_gaps(paths, known.robot.pose.heading_rad, centres, velocities, radii)
+    inside = np.asarray(shapely.contains_xy(known.free, paths[:, 0, :, 0], paths[:, 0, :, 1])).all(axis=1)
+    gaps[~inside & (OFFSETS_M != 0.0), :-1] = -np.inf
+    effort = 0.25 * np.abs(OFFSETS_M) + 0.3 * np.abs(OFFSETS_M - current_m)
+    score = np.where(gaps >= clearance_m, SPEEDS_MPS - effort[:, None], -np.inf)
+    if not np.isfinite(score).any():
+        score = gaps - 0.05 * effort[:, None]
+    lane, speed = np.unravel_index(int(np.argmax(score)), score.shape)
+    return float(OFFSETS_M[lane]), float(SPEEDS_MPS[speed])
 
 
 def lateral_of(known: Privileged) -> float:
@@ -170,31 +173,27 @@ def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
     return np.concatenate(centres), np.concatenate(velocities), np.concatenate(radii)
 
 
-def lane_paths(route: Polyline, s_m: float, lateral_m: float) -> tuple[Floats, Floats]:
-    """The lanes as points (offsets, ahead, 2) in metres and headings (ahead,) of the route there."""
-    along = np.minimum(s_m + AHEAD_M, route.length_m)
+def plans(route: Polyline, s_m: float, lateral_m: float) -> Floats:
+    """Where the robot would be on each lane, at each speed, at each of TIMES_S: (lanes, speeds, times, 2) metres."""
+    driven = SPEEDS_MPS[:, None] * TIMES_S
+    along = np.minimum(s_m + driven, route.length_m)
     x, y = np.interp(along, route.s_m, route.points[:, 0]), np.interp(along, route.s_m, route.points[:, 1])
-    x0, y0 = (
-        np.interp(along - 0.2, route.s_m, route.points[:, 0]),
-        np.interp(along - 0.2, route.s_m, route.points[:, 1]),
-    )
-    headings = np.arctan2(y - y0, x - x0)
-    shift = np.clip(OFFSETS_M[:, None] - lateral_m, -SHIFT_M_PER_M * AHEAD_M, SHIFT_M_PER_M * AHEAD_M)
-    lateral = lateral_m + shift
-    return np.stack([x - lateral * np.sin(headings), y + lateral * np.cos(headings)], axis=-1), headings
+    ahead = np.minimum(along + 0.2, route.length_m)
+    behind = ahead - 0.4
+    dx = np.interp(ahead, route.s_m, route.points[:, 0]) - np.interp(behind, route.s_m, route.points[:, 0])
+    dy = np.interp(ahead, route.s_m, route.points[:, 1]) - np.interp(behind, route.s_m, route.points[:, 1])
+    norm = np.maximum(np.hypot(dx, dy), 1e-9)
+    shift = SHIFT_M_PER_M * np.maximum(driven - SHIFT_AFTER_M, 0.0)
+    lateral = lateral_m + np.clip(OFFSETS_M[:, None, None] - lateral_m, -shift, shift)
+    return np.stack([x - lateral * dy / norm, y + lateral * dx / norm], axis=-1)
 
 
-def safe_speeds(
-    paths: Floats, headings: Floats, centres: Floats, velocities: Floats, radii: Floats, clearance_m: float
-) -> Floats:
-    """The highest of SPEEDS_MPS that is safe on each lane, (offsets,) m/s; 0 where none is."""
-    times = AHEAD_M / SPEEDS_MPS[:, None]
-    people = centres + velocities * times[..., None, None]
-    nose = 0.18 * np.column_stack([np.cos(headings), np.sin(headings)])
-    gap = np.full((len(paths), len(SPEEDS_MPS)), np.inf)
+def smallest_gaps(paths: Floats, heading_rad: float, centres: Floats, velocities: Floats, radii: Floats) -> Floats:
+    """The smallest gap of each plan between the body and any predicted disk, (lanes, speeds) metres."""
+    people = centres + velocities * TIMES_S[:, None, None]
+    nose = 0.18 * np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    gaps = np.full(paths.shape[:2], np.inf)
     for body in (paths + nose, paths - nose):
-        away = body[:, None, :, None, :] - people[None]
-        gaps = np.hypot(away[..., 0], away[..., 1]) - radii - BODY_RADIUS_M
-        gap = np.minimum(gap, gaps.min(axis=(2, 3)))
-    safe = gap >= clearance_m
-    return np.where(safe.any(axis=1), SPEEDS_MPS[np.argmax(safe, axis=1)], 0.0)
+        away = body[:, :, :, None, :] - people
+        gaps = np.minimum(gaps, (np.hypot(away[..., 0], away[..., 1]) - radii - BODY_RADIUS_M).min(axis=(2, 3)))
+    return gaps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Final
@@ -126,7 +127,7 @@ def draw_track(sheet: Sheet, log: Log) -> None:
     for piece in pieces:
         if len(piece) > 1:
             sheet.line(piece, TRACK, 0.15)
-    for before, after in zip(pieces, pieces[1:], strict=False):
+    for before, after in itertools.pairwise(pieces):
         if len(before) and len(after):
             dashes = LineString([before[-1], after[0]])
             at = np.arange(0.0, dashes.length, 0.8)
