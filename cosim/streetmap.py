@@ -142,7 +142,8 @@ class StreetMap:
     @cached_property
     def walkable(self) -> Polygon | MultiPolygon:
         """Union of every walkable piece. Seconds on a large map: prefer `walkable_near`."""
-        return union_closed([p.polygon for p in (*self.strips.values(), *self.corners.values())])
+        strips, corners = self.strips.values(), self.corners.values()
+        return union_closed([s.polygon for s in strips] + [c.polygon for c in corners])
 
     def locate(self, x_m: float, y_m: float, slack_m: float = 0.8) -> Located:
         """The walkable piece at a point (up to `slack_m` beside it), else the lane there, else "off"."""
