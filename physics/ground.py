@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cosim.geometry import Floats
+from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, Frontage
+from physics.robots import RobotModel
 from physics.tiles import Key, Tile, build_tile, key_at
 
 _KEPT: Final = 100
@@ -46,3 +48,14 @@ class Ground:
             here = np.array([k == key for k in keys])
             height[here] = self.tile(key).height(xy[here])
         return height
+
+    def lean(self, pose: Pose, model: RobotModel) -> tuple[float, float, float]:
+        """How a robot stands at a pose: height of the base frame in metres, roll and pitch in radians."""
+        cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+        ahead, aside = 0.5 * model.wheelbase_m, 0.5 * model.track_m
+        feet = [(a * ahead, b * aside) for a in (1, -1) for b in (1, -1)]
+        at = [(pose.x_m + cos * u - sin * v, pose.y_m + sin * u + cos * v) for u, v in feet]
+        front_left, front_right, rear_left, rear_right = self.heights(at).tolist()
+        pitch = math.atan2(rear_left + rear_right - front_left - front_right, 4.0 * ahead)
+        roll = math.atan2(front_left + rear_left - front_right - rear_right, 4.0 * aside)
+        return 0.25 * (front_left + front_right + rear_left + rear_right), roll, pitch

@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.geometry import Floats, Polyline
-from cosim.streetmap import StreetMap, Strip, union_closed
+from cosim.streetmap import PieceKind, StreetMap, Strip, union_closed
 from physics.mesh import Mesh, quads
 
 TILE_M: Final = 48.0
@@ -46,6 +46,7 @@ SURFACES: Mapping[str, tuple[str, tuple[float, float, float]]] = {
 }
 """Kinds of ground: label of cosim.state.LABELS, and colour."""
 
+_WALKED: Final[tuple[PieceKind, ...]] = ("strip", "corner")
 _LOW = ("road", "crossing", "stripe")
 
 Key = tuple[int, int]
@@ -113,8 +114,8 @@ def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, sha
     lanes = street_map.near("lane", reach)
     sidewalks = [s.polygon for s in strips if s.kind == "sidewalk"]
     corners: list[shapely.Geometry] = [c.polygon for c in street_map.near("corner", reach)]
-    roads = [lane.polygon for lane in lanes if getattr(lane, "kind", "") == "road"]
-    roads += [j.polygon for j in street_map.near("junction", reach)]
+    roads: list[shapely.Geometry] = [lane.polygon for lane in lanes if getattr(lane, "kind", "") == "road"]
+    roads += [part for j in street_map.near("junction", reach) for part in _driven(street_map, j.polygon)]
     verges = [lane.polygon for lane in lanes if getattr(lane, "kind", "") == "verge"]
     crossings = [s for s in strips if s.kind == "crossing"]
 
@@ -129,6 +130,17 @@ def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, sha
     for zone in (*zones.values(), stripes):
         shapely.prepare(zone)
     return zones, stripes
+
+
+def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
+    """The parts of a junction's outline that belong to its roads, not the slivers behind its corners."""
+    junction = shapely.make_valid(outline)
+    walked: list[shapely.Geometry] = [p.polygon for kind in _WALKED for p in street_map.near(kind, junction)]
+    lanes = [lane.polygon for lane in street_map.near("lane", junction) if getattr(lane, "kind", "") == "road"]
+    if not lanes or not walked:
+        return [junction]
+    parts = shapely.get_parts(shapely.difference(junction, union_closed([shapely.make_valid(p) for p in walked])))
+    return list(parts[shapely.dwithin(parts, shapely.union_all(lanes), 0.01)])
 
 
 def _union(polygons: Sequence[shapely.Geometry], reach: shapely.Polygon, closed: bool = True) -> shapely.Geometry:
@@ -218,7 +230,7 @@ def _walls(xy: Floats, high: Floats, triangles: NDArray[np.int64], is_low: NDArr
     keep = np.maximum(high[a], high[b]) > 1e-4
     a, b = a[keep], b[keep]
     at = [np.column_stack([xy[i], z]) for i, z in ((b, 0.0 * high[b]), (a, 0.0 * high[a]), (a, high[a]), (b, high[b]))]
-    walls = quads(np.stack(at, axis=1)[:, ::-1])
+    walls = quads(np.stack(at, axis=1))
     one, two = (walls.vertices[walls.triangles[:, i]] - walls.vertices[walls.triangles[:, 0]] for i in (1, 2))
     real = np.linalg.norm(np.cross(one, two), axis=1) > 1e-9
     return Mesh(walls.vertices, walls.normals, walls.triangles[real])

@@ -6,7 +6,6 @@ vehicles within reach. Pictures are drawn elsewhere (physics.camera), from the s
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from types import TracebackType
 from typing import Final, Literal, Self
@@ -84,14 +83,8 @@ class BulletWorld:
         bodies = self._engine
         self._stream(pose.x_m, pose.y_m)
         self._drive.reset()
-        forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
-        left = np.array([-forward[1], forward[0]])
-        axle, track = 0.3 * self.model.length_m, 0.5 * self.model.track_m
-        feet = [pose.xy + a * axle * forward + b * track * left for a in (1, -1) for b in (1, -1)]
-        z = self.ground.heights(feet)
-        pitch = math.atan2(0.5 * (z[2] + z[3] - z[0] - z[1]), 2.0 * axle)
-        roll = math.atan2(0.5 * (z[0] + z[2] - z[1] - z[3]), 2.0 * track)
-        bodies.place_robot((pose.x_m, pose.y_m, float(z.mean()) + 0.001), (roll, pitch, pose.heading_rad))
+        z, roll, pitch = self.ground.lean(pose, self.model)
+        bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:

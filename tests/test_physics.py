@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import math
 from collections.abc import Iterator
@@ -12,8 +13,11 @@ import pytest
 
 from cosim.errors import EngineError, UsageError
 from cosim.geometry import Pose
+from cosim.ports import CameraSpec
 from cosim.scenario import Barrier
-from cosim.state import Command, Motion, People, Street, Vehicles
+from cosim.state import LABELS, Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
+from physics.camera import BulletCamera
+from physics.people import PARTS, colours, swings
 from physics.robots import ROBOTS, robot
 from physics.world import BulletWorld
 
@@ -186,3 +190,113 @@ def test_an_unknown_robot_lists_the_known() -> None:
     with pytest.raises(UsageError, match="Valid choices: courier"):
         robot("rover")
     assert all(model.urdf.is_file() for model in ROBOTS.values())
+
+
+SPEC = CameraSpec(width=96, height=96)
+
+
+def seen(frame: Frame, name: str) -> np.ndarray:
+    """Rows and columns of the pixels with a label, (N, 2)."""
+    assert frame.labels is not None
+    return np.argwhere(frame.labels == LABELS[name])
+
+
+@pytest.mark.engine
+def test_the_camera_sees_the_street() -> None:
+    """From the sidewalk: sky above, sidewalk below, and the person ahead in the middle, the feet on the ground."""
+    world = BulletWorld(MAP, seed=1)
+    with BulletCamera(world, SPEC, depth=True) as camera:
+        robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
+        frame = camera.render(robot, person(-15.0, 5.0, math.pi))
+    assert frame.rgb.shape == (96, 96, 3) and frame.rgb.dtype == np.uint8
+    assert frame.labels is not None and frame.depth is not None
+    assert (frame.labels[:3, 46:60] == LABELS["sky"]).all()
+    assert (frame.labels[-3:, 20:76] == LABELS["sidewalk"]).all()
+    rows, columns = seen(frame, "person").T
+    assert abs(columns.mean() - 47.5) < 2.0
+    assert frame.depth[rows, columns].mean() == pytest.approx(4.7 * math.cos(math.radians(10.0)), abs=0.3)
+    down = math.atan(0.62 / 4.7) - math.radians(10.0)
+    assert rows.max() == pytest.approx(47.5 + 48.0 * math.tan(down) / math.tan(math.radians(37.5)), abs=2.0)
+
+
+@pytest.mark.engine
+def test_a_moved_person_is_drawn_where_the_snapshot_says() -> None:
+    """A person to the left is left in the picture, one to the right is right, and one behind is not in it."""
+    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+        robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
+        assert seen(camera.render(robot, person(-15.0, 6.0)), "person")[:, 1].mean() < 40.0
+        assert seen(camera.render(robot, person(-15.0, 4.0)), "person")[:, 1].mean() > 56.0
+        assert len(seen(camera.render(robot, person(-25.0, 5.0)), "person")) == 0
+
+
+@pytest.mark.engine
+def test_a_picture_depends_on_its_moment_alone() -> None:
+    """The same state is the same picture, whatever was drawn before and in whatever camera."""
+    robot = RobotState(Pose(-4.0, 5.0, 0.3), z_m=0.12)
+    street = person(-1.0, 5.5, math.pi)
+    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+        first = camera.render(robot, street)
+        camera.render(RobotState(Pose(60.0, -6.0, 1.0), z_m=0.12), person(62.0, -6.0))
+        camera.picture((0.0, 0.0, 5.0), (5.0, 5.0, 0.0), street, robot, size=(64, 48))
+        again = camera.render(robot, street)
+    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as other:
+        fresh = other.render(robot, street)
+    for frame in (again, fresh):
+        assert np.array_equal(frame.rgb, first.rgb)
+        assert np.array_equal(frame.labels, first.labels)
+
+
+@pytest.mark.engine
+def test_everything_has_its_label() -> None:
+    """One view over the street holds every label, and the lamp shows red or green as the signal says."""
+    strips = {k: dataclasses.replace(s, signalised=s.kind == "crossing") for k, s in MAP.strips.items()}
+    street_map = dataclasses.replace(MAP, strips=strips, _trees={})
+    fence = Barrier(x_m=4.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="ne", end=0)
+    vehicles = Vehicles.of(("v1",), [[-6.0, 1.75]], [math.pi], [5.0], [[4.5, 1.8]])
+    people = person(-8.0, 5.0).people
+    robot = RobotState(Pose(-10.0, 5.0, 0.0), z_m=0.12)
+    lit = {}
+    with BulletCamera(BulletWorld(street_map, seed=1, barriers=[fence]), SPEC) as camera:
+        for walk in (True, False):
+            street = Street(0, people, vehicles, {":c0": Signal(walk)})
+            frame = camera.picture((-16.0, 1.0, 5.0), (0.0, 1.0, 0.0), street, robot, size=(320, 240))
+            assert frame.labels is not None
+            assert {LABELS[n] for n in LABELS if n != "prop"} <= set(np.unique(frame.labels).tolist())
+            lamp = frame.rgb[frame.labels == LABELS["signal"]].astype(int)
+            lit[walk] = (lamp[:, 1] - lamp[:, 0]).max() > 60, (lamp[:, 0] - lamp[:, 1]).max() > 60
+    assert lit == {True: (True, False), False: (False, True)}
+
+
+@pytest.mark.engine
+def test_the_camera_leans_with_the_ramp() -> None:
+    """Facing up a ramp a person's head is lower in the picture by the slope's angle."""
+    heads = []
+    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+        for y, z in ((-1.0, 0.0), (4.22, 0.06)):
+            robot = RobotState(Pose(0.0, y, math.pi / 2), z_m=z)
+            heads.append(seen(camera.render(robot, person(0.0, y + 6.0)), "person")[:, 0].min())
+    assert heads[1] - heads[0] == pytest.approx(48.0 * math.tan(1.0 / 12.0) / math.tan(math.radians(37.5)), abs=2.0)
+
+
+@pytest.mark.engine
+def test_a_camera_outside_its_with_block_says_so() -> None:
+    """The message names the remedy, and closing twice is fine."""
+    camera = BulletCamera(BulletWorld(MAP, seed=1), SPEC)
+    with pytest.raises(EngineError, match="'with' block"):
+        camera.render(RobotState(OPEN), EMPTY)
+    with camera:
+        pass
+    camera.close()
+
+
+def test_people_stand_on_the_ground_and_look_alike_each_time() -> None:
+    """An upright body reaches from 0 to 1.7 m; colours hang on the id; a stop gesture lifts the right arm."""
+    low = min(part.mesh.vertices[:, 2].min() + part.joint_m[2] for part in PARTS)
+    high = max(part.mesh.vertices[:, 2].max() + part.joint_m[2] for part in PARTS)
+    assert low == pytest.approx(0.0, abs=0.01)
+    assert high == pytest.approx(1.7, abs=0.01)
+    assert colours("c12") == colours("c12")
+    people = People.of(("e1",), [[0.0, 0.0]], [0.0], [0.0], ("stop",))
+    arm = PARTS[5].mesh.tilted(float(swings(people, 0.0)[0][0, 5]), (0.0, 0.0, 0.0)).vertices
+    assert arm[:, 0].max() > 0.5
+    assert arm[:, 2].max() > 0.1

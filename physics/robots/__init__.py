@@ -24,6 +24,7 @@ class RobotModel:
     width_m: float
     wheel_radius_m: float
     track_m: float
+    wheelbase_m: float
     com_height_m: float
     left: tuple[str, ...]
     right: tuple[str, ...]
@@ -43,6 +44,7 @@ ROBOTS: Mapping[str, RobotModel] = MappingProxyType(
             width_m=0.55,
             wheel_radius_m=0.12,
             track_m=0.46,
+            wheelbase_m=0.42,
             com_height_m=0.20,
             left=("wheel_front_left", "wheel_rear_left"),
             right=("wheel_front_right", "wheel_rear_right"),

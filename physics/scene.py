@@ -1,0 +1,168 @@
+"""The street around a point as a canvas shows it: tiles, buildings, fences, signals, people, vehicles."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from cosim.clock import Clock
+from cosim.geometry import Floats, Pose
+from cosim.scenario import Barrier
+from cosim.state import People, Street, Vehicles
+from cosim.streetmap import Strip
+from physics import people, props, vehicles
+from physics.buildings import FACADES, WINDOWS, facade_meshes
+from physics.canvas import Canvas, Rigs
+from physics.ground import Ground
+from physics.robots import RobotModel
+from physics.tiles import SURFACES, Key, distance_to, key_at, keys_within, square
+
+VISIBLE_M: Final = 50.0
+_FORGET_M: Final = 70.0
+
+
+@dataclass(frozen=True, slots=True)
+class View:
+    """Where a picture is taken from. eye_m: (3,); heading_rad of the view; half_angle_rad: half its width."""
+
+    eye_m: Floats
+    heading_rad: float
+    half_angle_rad: float
+
+    def rows(self, xy: Floats, margin_m: float) -> NDArray[np.intp]:
+        """Which of (N, 2) points can be in the picture, things of radius `margin_m` standing on them."""
+        offset = xy - self.eye_m[:2]
+        cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
+        ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
+        wide = aside * math.cos(self.half_angle_rad) - ahead * math.sin(self.half_angle_rad)
+        return np.flatnonzero((wide < margin_m) & (ahead > -margin_m) & (np.hypot(ahead, aside) < VISIBLE_M))
+
+
+@dataclass(frozen=True, slots=True)
+class _TileBodies:
+    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in it."""
+
+    bodies: dict[int, tuple[tuple[float, float, float], float]]
+    posts: list[props.SignalPost]
+
+
+class Scene:
+    """Keeps the canvas as the street around a view; what is drawn depends on view and street alone."""
+
+    def __init__(self, canvas: Canvas, ground: Ground, barriers: Sequence[Barrier], model: RobotModel) -> None:
+        self._canvas = canvas
+        self._ground = ground
+        self._model = model
+        self._tiles: dict[Key, _TileBodies] = {}
+        self._shown: set[Key] = set()
+        self._post = canvas.shape(props.post_mesh())
+        self._walkers = Rigs(canvas, [part.mesh for part in people.PARTS], "person")
+        self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
+        self._vehicles: dict[tuple[float, float], Rigs] = {}
+        self._robot = canvas.load(model.urdf, "robot")
+        for barrier in barriers:
+            z = float(ground.heights([[barrier.x_m, barrier.y_m]])[0])
+            for mesh, colour in zip(props.barrier_meshes(barrier), (props.RED, props.WHITE), strict=True):
+                body = canvas.add(mesh, colour, "barrier")
+                canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
+
+    def arrange(self, view: View, street: Street) -> None:
+        """Let the canvas hold everything that this view can show, the robot left out."""
+        self._stream(view)
+        self._show_people(view, street.people, Clock().time_s(street.tick))
+        self._show_vehicles(view, street.vehicles)
+        self._show_signals(street)
+        self._canvas.put_away(self._robot)
+
+    def show_robot(self, pose: Pose, z_m: float, roll_rad: float, pitch_rad: float) -> None:
+        """Set the robot's base frame there, until the next `arrange`."""
+        h = self._model.com_height_m
+        ahead = h * math.sin(pitch_rad)
+        x, y = pose.x_m + ahead * math.cos(pose.heading_rad), pose.y_m + ahead * math.sin(pose.heading_rad)
+        self._canvas.put_turned(self._robot, (x, y, z_m + h), (roll_rad, pitch_rad, pose.heading_rad))
+
+    def _stream(self, view: View) -> None:
+        x, y = float(view.eye_m[0]), float(view.eye_m[1])
+        for key in [k for k in self._tiles if distance_to(k, x, y) > _FORGET_M]:
+            self._canvas.remove(list(self._tiles.pop(key).bodies))
+            self._shown.discard(key)
+        wanted = set(keys_within(x, y, VISIBLE_M))
+        for key in self._shown - wanted:
+            for body in self._tiles[key].bodies:
+                self._canvas.put_away(body)
+        for key in keys_within(x, y, VISIBLE_M):
+            if key not in self._tiles:
+                self._tiles[key] = self._built(key)
+            if key not in self._shown:
+                for body, (at, heading_rad) in self._tiles[key].bodies.items():
+                    self._canvas.put(body, at, heading_rad)
+        self._shown = wanted
+
+    def _built(self, key: Key) -> _TileBodies:
+        x0, y0, x1, y1 = square(key)
+        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
+        parts = [(mesh, SURFACES[name][1], SURFACES[name][0]) for name, mesh in self._ground.tile(key).parts.items()]
+        for facade, mesh in facade_meshes(self._ground.buildings(key)).items():
+            parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
+        at = (float(middle[0]), float(middle[1]), 0.0)
+        bodies = {self._canvas.add(mesh.moved(-middle), colour, label): (at, 0.0) for mesh, colour, label in parts}
+        street_map = self._ground.street_map
+        strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
+        crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
+        posts = [post for s in crossings for post in props.signal_posts(street_map, s)]
+        posts = [post for post in posts if key_at(post.x_m, post.y_m) == key]
+        for post in posts:
+            bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
+        return _TileBodies(bodies, posts)
+
+    def _foot(self, post: props.SignalPost) -> tuple[float, float, float]:
+        return post.x_m, post.y_m, float(self._ground.heights([[post.x_m, post.y_m]])[0])
+
+    def _show_people(self, view: View, who: People, time_s: float) -> None:
+        rows = view.rows(who.xy, 1.0)
+        z = self._ground.heights(who.xy[rows])
+        about_y, about_z = people.swings(who, time_s)
+        self._walkers.start()
+        for foot_z, i in zip(z.tolist(), rows.tolist(), strict=True):
+            x, y = who.xy[i].tolist()
+            heading, colours = float(who.heading[i]), people.colours(who.ids[i])
+            cos, sin = math.cos(heading), math.sin(heading)
+            for k, (body, part) in enumerate(zip(self._walkers.lend(), people.PARTS, strict=True)):
+                jx, jy, jz = part.joint_m
+                at = (x + cos * jx - sin * jy, y + sin * jx + cos * jy, foot_z + jz)
+                self._canvas.put(body, at, heading + float(about_z[i, k]), float(about_y[i, k]))
+                self._canvas.paint(body, colours[part.coat])
+        self._walkers.finish()
+
+    def _show_vehicles(self, view: View, which: Vehicles) -> None:
+        for rigs in self._vehicles.values():
+            rigs.start()
+        for i in view.rows(which.xy, 6.0):
+            size = (round(float(which.size[i, 0]), 1), round(float(which.size[i, 1]), 1))
+            if size not in self._vehicles:
+                self._vehicles[size] = Rigs(self._canvas, vehicles.vehicle_meshes(*size), "vehicle")
+            colours = (vehicles.paint(which.ids[i]), vehicles.GLASS, vehicles.TYRE)
+            for body, colour in zip(self._vehicles[size].lend(), colours, strict=True):
+                self._canvas.put(body, (float(which.xy[i, 0]), float(which.xy[i, 1]), 0.0), float(which.heading[i]))
+                self._canvas.paint(body, colour)
+        for rigs in self._vehicles.values():
+            rigs.finish()
+
+    def _show_signals(self, street: Street) -> None:
+        for rigs in self._lamps.values():
+            rigs.start()
+        for key in sorted(self._shown):
+            for post in self._tiles[key].posts:
+                if post.crossing in street.signals:
+                    walk = street.signals[post.crossing].walk
+                    (lamp,) = self._lamps[walk].lend()
+                    self._canvas.put(lamp, self._foot(post), post.heading_rad)
+                    self._canvas.paint(lamp, props.LAMPS[walk])
+        for rigs in self._lamps.values():
+            rigs.finish()
