@@ -9,6 +9,7 @@ from typing import Annotated
 
 import pandas as pd
 import typer
+from rich import box
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -19,7 +20,7 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
+from rich.table import Column, Table
 
 from cosim.errors import CosimError, UsageError
 
@@ -36,11 +37,11 @@ err = Console(stderr=True)
 SHOWN = (
     ("success", "SR"),
     ("route_completion", "RC"),
-    ("failures_per_100m", "FC /100m"),
+    ("failures_per_100m", "FC"),
     ("collisions_per_100m", "C"),
     ("out_of_lane_per_100m", "OL"),
     ("freezings_per_100m", "F"),
-    ("velocity_mean_mps", "V m/s"),
+    ("velocity_mean_mps", "V"),
 )
 COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
 
@@ -64,14 +65,14 @@ def run(
     """Run a suite with a policy and print its table."""
     from cosim.policies.load import load_policy
     from cosim.runfolder import RunFolder, RunSpec
-    from scenarios.assemble import manifest_of, versions
+    from cosim.versions import versions
     from scenarios.catalog import chosen
     from scenarios.catalog import suite as shipped
     from scenarios.pool import run_all
 
     whole = shipped(suite)
     picked = chosen(whole, scenario or (), episodes)
-    manifest = manifest_of(load_policy(policy))
+    manifest = load_policy(policy).manifest
     spec = RunSpec(
         suite=whole.name,
         suite_version=whole.version,
@@ -199,8 +200,8 @@ class Board:
 
     def tell(self, message: object) -> None:
         """Take in what a worker says."""
-        from scenarios.worker import Done
-        from scenarios.worker import Progress as Report
+        from scenarios.messages import Done
+        from scenarios.messages import Progress as Report
 
         if isinstance(message, Report):
             task = self._tasks.get(message.scenario)
@@ -222,20 +223,20 @@ def print_table(table: pd.DataFrame, scheduled: int) -> None:
     """The table of a run: a row per episode, then the means with their intervals."""
     from cosim.results import summary_of
 
-    shown = Table("episode", "ended", *(head for _, head in SHOWN), "events C/OL/F", "hash")
+    shown = Table(
+        Column("episode", no_wrap=True), "ended", *(head for _, head in SHOWN), "count C/OL/F", box=box.SIMPLE_HEAD
+    )
     for _, row in table.iterrows():
         counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
         ended = row["ended"] if row["status"] == "done" else row["status"]
-        cells = ("-" if pd.isna(row[name]) else f"{row[name]:.2f}" for name, _ in SHOWN)
-        shown.add_row(row["scenario"], ended, *cells, counts, str(row["state_hash"])[:8])
-    if len(table):
-        summary = summary_of(table, [name for name, _ in SHOWN])
-        shown.add_section()
-        shown.add_row("mean", "", *(_cell(row["mean"]) for _, row in summary.iterrows()))
-        intervals = (f"{_cell(r['low'])}-{_cell(r['high'])}" if r["n"] else "-" for _, r in summary.iterrows())
-        shown.add_row("95 %", "", *intervals)
-        shown.add_row("n", "", *(f"{row['n']:.0f}" for _, row in summary.iterrows()))
+        shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
     out.print(shown)
+    if len(table):
+        means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
+        for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
+            interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+            means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
+        out.print(means)
     crashed = table[table["status"] == "crashed"]
     out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}")
     for _, row in crashed.iterrows():

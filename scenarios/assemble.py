@@ -7,11 +7,9 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
-from importlib.metadata import version
 from pathlib import Path
 
 import shapely
-from physics.camera import BulletCamera
 from shapely.geometry import LineString
 
 from bridge import keys
@@ -19,11 +17,11 @@ from bridge.director import RemoteDirector, serve_director
 from bridge.session import Session
 from cosim.clock import Clock
 from cosim.control import Limits
-from cosim.errors import PolicyError
 from cosim.loop import Parts
-from cosim.ports import Director, Manifest, Policy
+from cosim.ports import Director, Policy
 from cosim.scenario import City, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
+from physics.camera import BulletCamera
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
@@ -33,8 +31,6 @@ from sumo_nets.store import city_net
 
 CORRIDOR_M = 40.0
 """The walkable area is judged this far around the route; beyond it everything is out of lane."""
-
-PACKAGES = ("sidewalk-cosim", "libsumo", "eclipse-sumo", "pybullet", "eclipse-zenoh", "numpy", "scipy", "shapely")
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +46,7 @@ class Stage:
 @contextmanager
 def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
     """Start every engine of a scenario; all are closed at the end, whatever happened."""
-    manifest = manifest_of(policy)
+    manifest = policy.manifest
     clock = Clock.for_rate(manifest.rate_hz)
     net_path, street_map = place(scenario.place)
     walkable = street_map.walkable_near(shapely.buffer(LineString(scenario.route), CORRIDOR_M))
@@ -82,22 +78,8 @@ def directed(env: str) -> Iterator[Director]:
         yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
 
 
-def manifest_of(policy: Policy) -> Manifest:
-    """A policy's manifest. Raises PolicyError when it has none."""
-    manifest = getattr(policy, "manifest", None)
-    if not isinstance(manifest, Manifest):
-        raise PolicyError(f"{type(policy).__name__} has no 'manifest' that is a cosim.ports.Manifest")
-    return manifest
-
-
 @lru_cache(maxsize=1)
 def place(city: City) -> tuple[Path, StreetMap]:
     """The net of a place and what was read from it; the last one is kept."""
     path = city_net(city)
     return path, read_net(path)
-
-
-@lru_cache(maxsize=1)
-def versions() -> dict[str, str]:
-    """Versions of everything that a state hash depends on."""
-    return {package: version(package) for package in PACKAGES}

@@ -14,8 +14,9 @@ from cosim.errors import CosimError
 from cosim.events import EventQuery
 from cosim.policies.baselines import Straight
 from cosim.scenario import City, CrowdSpec, Scenario
+from cosim.versions import versions
 from cosim.walks import WalkGraph
-from scenarios.assemble import directed, place, staged, versions
+from scenarios.assemble import directed, place, staged
 from scenarios.long_horizon import build
 from sumo_nets.store import cache_folder
 

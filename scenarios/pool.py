@@ -20,9 +20,9 @@ from cosim.ports import Manifest
 from cosim.record import Record
 from cosim.runfolder import RunFolder
 from cosim.scenario import Scenario, content_hash
+from cosim.versions import versions
 from scenarios import worker
-from scenarios.assemble import versions
-from scenarios.worker import Done, Job, Message, Progress
+from scenarios.messages import Done, Job, Message, decode_message, encode
 
 ATTEMPTS = 2
 SILENCE_S = 300.0
@@ -92,9 +92,7 @@ class _Pool:
         idle.job, idle.heard_at = scenario, time.monotonic()
         target = str(self._folder.episode_folder(scenario.id))
         try:
-            idle.pipe.send_bytes(
-                worker.encode(Job(scenario, self._folder.spec.suite_hash, target, self._frames_every_s))
-            )
+            idle.pipe.send_bytes(encode(Job(scenario, self._folder.spec.suite_hash, target, self._frames_every_s)))
         except BrokenPipeError:
             idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out
 
@@ -115,7 +113,7 @@ class _Pool:
         """Everything a worker has said since; False when its pipe is closed or it has been silent."""
         try:
             while one.pipe.poll():
-                message = worker.decode_message(one.pipe.recv_bytes())
+                message = decode_message(one.pipe.recv_bytes())
                 one.heard_at = time.monotonic()
                 if isinstance(message, Done):
                     self._folder.add(Record.load(self._folder.episode_folder(message.scenario) / "record.json"))
@@ -193,6 +191,3 @@ def _last_words(log: Path) -> str:
         return ""
     said = log.read_text(errors="replace").strip()[-LOG_TAIL:].strip()
     return f"; it last printed: {said}" if said else ""
-
-
-__all__ = ["Progress", "run_all"]

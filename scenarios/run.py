@@ -19,7 +19,8 @@ from cosim.record import Log, Record, Recorder, TriggeredEvent
 from cosim.referee import Failure, Referee, Verdict
 from cosim.scenario import Scenario, content_hash
 from cosim.step import Step
-from scenarios.assemble import Stage, manifest_of, staged, versions
+from cosim.versions import versions
+from scenarios.assemble import Stage, staged
 
 PASSED_M = 5.0
 """An event lies behind once the robot is this far beyond its place."""
@@ -39,7 +40,7 @@ class Outcome:
 def episode(scenario: Scenario, policy: Policy, *, suite_hash: str = "", watch: Watch | None = None) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`."""
     began = time.perf_counter()
-    manifest = manifest_of(policy)
+    manifest = policy.manifest
     record = Record(
         scenario=scenario.id,
         scenario_hash=content_hash(scenario),

@@ -12,51 +12,20 @@ import signal
 import sys
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING
 
 import cv2
-import msgspec
 
 from cosim.policies.load import load_policy
 from cosim.referee import Verdict
-from cosim.scenario import Scenario
 from cosim.step import Step
-from scenarios.run import Watch, episode
+from scenarios.messages import Done, Job, Progress, decode_job, encode
+
+if TYPE_CHECKING:
+    from scenarios.run import Watch
 
 REPORT_EVERY_TICKS = 20
 PR_SET_PDEATHSIG = 1
-
-
-class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames."""
-
-    scenario: Scenario
-    suite_hash: str
-    folder: str
-    frames_every_s: float = 0.0
-
-
-class Progress(msgspec.Struct, frozen=True, tag=True):
-    """A sign of life: how far the episode is."""
-
-    scenario: str
-    time_s: float
-    route_s_m: float
-    failures: int
-
-
-class Done(msgspec.Struct, frozen=True, tag=True):
-    """The episode is over and its record is on disk."""
-
-    scenario: str
-    status: Literal["done", "crashed"]
-
-
-Message = Progress | Done
-
-encode = msgspec.msgpack.Encoder().encode
-decode_job = msgspec.msgpack.Decoder(Job).decode
-decode_message = msgspec.msgpack.Decoder(Message).decode
 
 
 def main(pipe: Connection, policy: str, log_path: str) -> None:
@@ -66,6 +35,8 @@ def main(pipe: Connection, policy: str, log_path: str) -> None:
     with Path(log_path).open("ab", buffering=0) as log:
         os.dup2(log.fileno(), 1)
         os.dup2(log.fileno(), 2)
+    from scenarios.run import episode  # the engines greet on stdout when they are imported
+
     driver = load_policy(policy)
     while True:
         try:

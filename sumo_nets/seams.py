@@ -53,7 +53,8 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     edges = shapely.linestrings(np.stack([right, left], axis=1))
     met = shapely.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
-    wedges = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
+    hulls = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
+    wedges = shapely.difference(hulls, corners)
     grown = shapely.union(polygons, wedges)
     whole = shapely.get_type_id(grown) == 3
     out: Polygons = polygons.copy()

@@ -1,0 +1,41 @@
+"""What a run and its environment processes say to each other: MessagePack over a pipe."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from cosim.scenario import Scenario
+
+
+class Job(msgspec.Struct, frozen=True, tag=True):
+    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames."""
+
+    scenario: Scenario
+    suite_hash: str
+    folder: str
+    frames_every_s: float = 0.0
+
+
+class Progress(msgspec.Struct, frozen=True, tag=True):
+    """A sign of life: how far the episode is."""
+
+    scenario: str
+    time_s: float
+    route_s_m: float
+    failures: int
+
+
+class Done(msgspec.Struct, frozen=True, tag=True):
+    """The episode is over and its record is on disk."""
+
+    scenario: str
+    status: Literal["done", "crashed"]
+
+
+Message = Progress | Done
+
+encode = msgspec.msgpack.Encoder().encode
+decode_job = msgspec.msgpack.Decoder(Job).decode
+decode_message = msgspec.msgpack.Decoder(Message).decode
