@@ -100,7 +100,6 @@ class Referee:
         if step.tick + 1 >= self._limit_ticks:
             return Verdict(failure, None, "timeout", red, waits)
         reset = self._reset(failure, step)
-        self._touching.clear()
         self._window.clear()
         return Verdict(failure, reset, None, red, waits)
 
