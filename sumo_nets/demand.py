@@ -254,8 +254,8 @@ class Drivers:
             for lane in self._lanes[edge]:
                 for to, *_, turn, _ in self._engine.lane.getLinks(lane):
                     to_edge = to.rsplit("_", 1)[0]
-                    if to_edge in self._lanes:
-                        onward[to_edge] = turn in "tT"
+                    if to in self._lanes.get(to_edge, ()):
+                        onward[to_edge] = turn in "tT" and onward.get(to_edge, True)
             ahead = tuple(to for to, back in sorted(onward.items()) if not back)
             self._next[edge] = ahead or tuple(sorted(onward))
         return self._next[edge]

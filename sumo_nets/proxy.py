@@ -28,18 +28,23 @@ END_M = 2.0
 
 
 class Walk(NamedTuple):
-    """A walk of a proxy: from `first` over `junction`, where it ends, to `second`."""
+    """A walk of a proxy: from sidewalk `first` to sidewalk `second`, over the place `around` where they meet."""
 
-    junction: str
+    around: str
     first: str
     second: str
 
 
 class Walks:
-    """Chooses a proxy's walk from where it is and where it heads."""
+    """Chooses a proxy's walk from where it is and where it heads.
+
+    A meeting place is named by the first of the corners that crossings of one junction join, or by the junction
+    where there is no corner. Sidewalks of one junction that do not meet make a walk that crashes SUMO.
+    """
 
     def __init__(self, engine: Any, street_map: StreetMap) -> None:
         self.street_map = street_map
+        self._place = _meeting_places(street_map)
         self._ends: dict[str, tuple[str, str]] = {}
         self._into: dict[str, list[str]] = {}
         self._at: dict[str, list[str]] = {}
@@ -47,38 +52,48 @@ class Walks:
             if strip.kind == "sidewalk":
                 ends = (engine.edge.getFromJunction(strip.id), engine.edge.getToJunction(strip.id))
                 self._ends[strip.id] = ends
-                self._into.setdefault(ends[1], []).append(strip.id)
-                for junction in dict.fromkeys(ends):
-                    self._at.setdefault(junction, []).append(strip.id)
+                for end in (0, 1):
+                    for place in {self._meeting(strip.id, end): 0, ends[end]: 0}:
+                        self._at.setdefault(place, []).append(strip.id)
+                        if end == 1:
+                            self._into.setdefault(place, []).append(strip.id)
 
     def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
         """Whether SUMO sees a proxy on `edge` when it has `walk`."""
         if edge.startswith(":"):
-            return walk.junction == junction_of(edge) == self._ends[walk.first][1]
-        return walk.first == edge and walk.junction == self._ahead(edge, pose)
+            return walk.around == self._inside(edge) and walk.first in self._into[walk.around]
+        return walk.first == edge and walk.around == self._ahead(edge, pose)
 
     def choose(self, edge: str, pose: Pose) -> Walk | None:
         """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
         if edge.startswith(":"):
-            junction = junction_of(edge)
-            firsts = self._into.get(junction, [])
+            around = self._inside(edge)
+            firsts = self._into.get(around, [])
         elif edge in self._ends:
-            junction = self._ahead(edge, pose)
+            around = self._ahead(edge, pose)
             firsts = [edge]
         else:
             return None
         fallback: Walk | None = None
         for first in firsts:
-            for second in self._at.get(junction, []):
+            for second in self._at.get(around, []):
                 if second == first:
                     continue
                 if self._ends[second] != self._ends[first][::-1]:
-                    return Walk(junction, first, second)
-                fallback = fallback or Walk(junction, first, second)
+                    return Walk(around, first, second)
+                fallback = fallback or Walk(around, first, second)
         return fallback
 
+    def _inside(self, edge: str) -> str:
+        """The meeting place of a corner or crossing; the junction of any other edge inside one."""
+        return self._place.get(edge) or junction_of(edge)
+
+    def _meeting(self, strip: str, end: int) -> str:
+        corner = self.street_map.strips[strip].corners[end]
+        return self._ends[strip][end] if corner is None else self._place[corner]
+
     def _ahead(self, edge: str, pose: Pose) -> str:
-        """The junction at the end of a sidewalk that a pose heads to.
+        """The meeting place at the end of a sidewalk that a pose heads to.
 
         Near the end where the edge ends it is always that one: SUMO may map a proxy there to the walking area, and
         crashes when its walk turns away from it.
@@ -87,7 +102,7 @@ class Walks:
         (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
         forward = (x1 - x0) * math.cos(pose.heading_rad) + (y1 - y0) * math.sin(pose.heading_rad) >= 0.0
         at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + END_M
-        return self._ends[edge][1 if forward or at_end else 0]
+        return self._meeting(edge, 1 if forward or at_end else 0)
 
 
 class Proxy:
@@ -152,3 +167,21 @@ class Proxy:
 def junction_of(internal: str) -> str:
     """The junction of a walking area, crossing or internal edge: "a_b" of ":a_b_w0"."""
     return internal[1:].rsplit("_", 1)[0]
+
+
+def _meeting_places(street_map: StreetMap) -> dict[str, str]:
+    """Corner or crossing id -> id of the first of the corners that it is joined with by crossings."""
+    place = {corner: corner for corner in street_map.corners}
+
+    def root(corner: str) -> str:
+        while place[corner] != corner:
+            corner = place[corner]
+        return corner
+
+    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
+    for crossing in crossings:
+        joined = sorted({root(corner) for corner in crossing.corners if corner is not None})
+        for corner in joined:
+            place[corner] = joined[0]
+    roots = {corner: root(corner) for corner in place}
+    return roots | {c.id: roots[c.corners[0] or c.corners[1] or ""] for c in crossings if any(c.corners)}
