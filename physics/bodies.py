@@ -13,7 +13,7 @@ from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M, RobotState
 from physics.buildings import Building
-from physics.mesh import join
+from physics.mesh import as_lists, join
 from physics.robots import RobotModel
 from physics.tiles import CURB_M, Tile
 
@@ -74,13 +74,9 @@ class Bodies:
         """The ground of a tile and its buildings; returns what `remove` takes."""
         mesh = join(list(tile.parts.values()))
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
-        shape = self._do(
-            "createCollisionShape",
-            p.GEOM_MESH,
-            vertices=(mesh.vertices - middle).tolist(),
-            indices=mesh.triangles.ravel().tolist(),
-            flags=p.GEOM_FORCE_CONCAVE_TRIMESH,
-        )
+        flags = p.GEOM_FORCE_CONCAVE_TRIMESH
+        with as_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
+            shape = self._do("createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags)
         ground = self._body(shape, middle)
         self._do("changeDynamics", ground, -1, lateralFriction=_GROUND_FRICTION)
         return [ground, *(self._add_building(b) for b in buildings)]

@@ -26,6 +26,8 @@ NEAR_M: Final = 0.05
 FAR_M: Final = 160.0
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
 _ZENITH: Final = np.array([92.0, 142.0, 205.0], dtype=np.float32)
+_TILES_MAX: Final = 150
+"""Tiles built before the renderer is started afresh: PyBullet gives the memory of drawn shapes back only then."""
 _CLEAR_M: Final = 20.0
 _HAZE_M: Final = 110.0
 
@@ -88,6 +90,9 @@ class BulletCamera:
         street: Street,
         robot: RobotState | None,
     ) -> Frame:
+        if self._scene is not None and self._scene.built > _TILES_MAX:
+            self.close()
+            self.__enter__()
         if self._canvas is None or self._scene is None:
             raise EngineError("the camera is not running: use BulletCamera in a 'with' block")
         ahead = target - eye

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from cosim.errors import EngineError
 from cosim.geometry import Floats
 from cosim.state import LABELS
-from physics.mesh import Mesh
+from physics.mesh import Mesh, as_lists
 
 Colour = tuple[float, float, float]
 
@@ -43,13 +43,10 @@ class Canvas:
 
     def shape(self, mesh: Mesh) -> int:
         """A form that bodies can share."""
-        shape: int = p.createVisualShape(
-            p.GEOM_MESH,
-            vertices=mesh.vertices.tolist(),
-            indices=mesh.triangles.ravel().tolist(),
-            normals=mesh.normals.tolist(),
-            physicsClientId=self._client,
-        )
+        with as_lists(mesh.triangles, mesh.vertices, mesh.normals) as (indices, (vertices, normals)):
+            shape: int = p.createVisualShape(
+                p.GEOM_MESH, vertices=vertices, indices=indices, normals=normals, physicsClientId=self._client
+            )
         return shape
 
     def add(self, form: Mesh | int, colour: Colour, label: str) -> int:

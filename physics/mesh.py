@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,6 +47,34 @@ class Mesh:
         turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
         pivot = np.asarray(pivot_m)
         return Mesh((self.vertices - pivot) @ turn.T + pivot, self.normals @ turn.T, self.triangles)
+
+
+_idle_rows: list[list[float]] = []
+
+
+@contextmanager
+def as_lists(indices: Ints, *tables: Floats) -> Iterator[tuple[list[int], list[list[list[float]]]]]:
+    """A flat array and (N, 3) tables as the lists PyBullet wants, for the time of one call.
+
+    PyBullet never lets go of a list it was given, nor of the rows in it: so rows are used again and again, and
+    what else it keeps is left empty.
+    """
+    flat = indices.ravel().tolist()
+    lists = []
+    for table in tables:
+        rows = table.tolist()
+        for k, values in enumerate(rows):
+            row = _idle_rows.pop() if _idle_rows else []
+            row[:] = values
+            rows[k] = row
+        lists.append(rows)
+    try:
+        yield flat, lists
+    finally:
+        flat.clear()
+        for rows in lists:
+            _idle_rows.extend(rows)
+            rows.clear()
 
 
 EMPTY = Mesh(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int32))

@@ -53,7 +53,10 @@ class _TileBodies:
 
 
 class Scene:
-    """Keeps the canvas as the street around a view; what is drawn depends on view and street alone."""
+    """Keeps the canvas as the street around a view; what is drawn depends on view and street alone.
+
+    built: number of tiles made since the start.
+    """
 
     def __init__(self, canvas: Canvas, ground: Ground, barriers: Sequence[Barrier], model: RobotModel) -> None:
         self._canvas = canvas
@@ -61,6 +64,7 @@ class Scene:
         self._model = model
         self._tiles: dict[Key, _TileBodies] = {}
         self._shown: set[Key] = set()
+        self.built = 0
         self._post = canvas.shape(props.post_mesh())
         self._walkers = Rigs(canvas, [part.mesh for part in people.PARTS], "person")
         self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
@@ -99,6 +103,7 @@ class Scene:
         for key in keys_within(x, y, VISIBLE_M):
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
+                self.built += 1
             if key not in self._shown:
                 for body, (at, heading_rad) in self._tiles[key].bodies.items():
                     self._canvas.put(body, at, heading_rad)
