@@ -52,10 +52,12 @@ def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
     walkable = street_map.walkable_near(shapely.buffer(LineString(scenario.route), CORRIDOR_M))
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     with ExitStack() as stack:
-        crowd = SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2])
-        stack.enter_context(crowd)
         world = BulletWorld(street_map, scenario.place.seed, scenario.barriers, scenario.robot)
         stack.enter_context(world)
+        crowd = SumoCrowd(
+            net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2], world.footprint_m
+        )
+        stack.enter_context(crowd)
         camera = None
         if manifest.camera is not None:
             camera = stack.enter_context(BulletCamera(world, manifest.camera))

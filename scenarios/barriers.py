@@ -104,6 +104,8 @@ def prove_single_path(
     passable = _part_with(shapely.buffer(part, -half_width_m), start)
     if passable is None or not passable.covers(goal):
         raise SpecError(f"somewhere the way is narrower than {2 * half_width_m:.2f} m")
+    if not passable.covers(LineString(route.points)):
+        raise SpecError(f"the route comes nearer than {half_width_m:.2f} m to the edge of the walkable area")
     return part
 
 

@@ -27,6 +27,7 @@ from cosim.scenario import CrowdSpec
 from cosim.state import People, RobotState, Street, Vehicles
 from cosim.streetmap import Port, StreetMap
 from sumo_nets.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.giveway import Body
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
 from sumo_nets.smooth import PoseFilter
@@ -56,6 +57,7 @@ class SumoCrowd(Crowd):
     """The crowd around the robot on the street net at `net_path`, of which `street_map` was read.
 
     closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
+    footprint_m: its length and width.
     Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
     """
 
@@ -69,9 +71,11 @@ class SumoCrowd(Crowd):
         seed: int,
         closed: frozenset[Port],
         start_xy: tuple[float, float],
+        footprint_m: tuple[float, float] = (0.7, 0.55),
     ) -> None:
         self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
         self._closed, self._start_xy = closed, start_xy
+        self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._street: Street | None = None
 
     def __enter__(self) -> Self:
@@ -121,7 +125,8 @@ class SumoCrowd(Crowd):
             self._robot.update(robot.pose)
             self._mirror(reply.actors)
             libsumo.simulationStep()
-            self._street = self._read(tick + 1, x_m, y_m, reply.actors)
+            body = Body(robot.pose, self._half_m)
+            self._street = self._read(tick + 1, x_m, y_m, reply.actors, body)
         return self._street
 
     def _launch(self, sumo_seed: int, begin_s: int) -> None:
@@ -159,7 +164,7 @@ class SumoCrowd(Crowd):
                 libsumo.simulationStep()
         self._pedestrians.fill(x_m, y_m)
         libsumo.simulationStep()
-        self._street = self._read(0, x_m, y_m, ())
+        self._street = self._read(0, x_m, y_m, (), None)
 
     def _watch(self, x_m: float, y_m: float) -> None:
         """One subscription each to the persons and to the vehicles around a point that follows the robot."""
@@ -182,7 +187,7 @@ class SumoCrowd(Crowd):
                 self._actors[actor.id] = Proxy(libsumo, self._walks, base=actor.id, kind="event", serial=self._serial)
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
-    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...]) -> Street:
+    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: Body | None) -> Street:
         persons: dict[str, Row] = {}
         vehicles: dict[str, Row] = {}
         found: dict[str, Any] = libsumo.poi.getContextSubscriptionResults(EYE)
@@ -193,12 +198,13 @@ class SumoCrowd(Crowd):
                 heading_rad = heading_from_sumo(values[tc.VAR_ANGLE])
                 kind[name] = (*xy, heading_rad, values[tc.VAR_SPEED], values[tc.VAR_WAITING_TIME])
         self._seen = tuple({i: Seen(v[0], v[1], v[4]) for i, v in kind.items()} for kind in (persons, vehicles))
-        return Street(tick, self._people(persons, actors), self._vehicles(vehicles), self._signals.near(x_m, y_m))
+        people = self._people(persons, actors, body)
+        return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
-    def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...]) -> People:
+    def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...], body: Body | None) -> People:
         ids = tuple(persons)
         table = np.array(list(persons.values()), dtype=float).reshape(-1, 5)
-        xy, heading, speed = self._poses.update(ids, table[:, :2], table[:, 2], table[:, 3])
+        xy, heading, speed = self._poses.update(ids, table[:, :2], table[:, 2], table[:, 3], body)
         cast = sorted(actors, key=lambda actor: actor.id)
         return People.of(
             (*ids, *(a.id for a in cast)),

@@ -48,6 +48,7 @@ class Walks:
         self._ends: dict[str, tuple[str, str]] = {}
         self._into: dict[str, list[str]] = {}
         self._at: dict[str, list[str]] = {}
+        self._best: dict[str, Walk | None] = {}
         for strip in street_map.strips.values():
             if strip.kind == "sidewalk":
                 ends = (engine.edge.getFromJunction(strip.id), engine.edge.getToJunction(strip.id))
@@ -61,28 +62,45 @@ class Walks:
     def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
         """Whether SUMO sees a proxy on `edge` when it has `walk`."""
         if edge.startswith(":"):
-            return walk.around == self._inside(edge) and walk.first in self._into[walk.around]
+            best = self.choose(edge, pose)
+            return best == walk or (
+                best is not None
+                and walk.around == best.around
+                and walk.first in self._into[walk.around]
+                and self._touched(walk, edge) >= self._touched(best, edge)
+            )
         return walk.first == edge and walk.around == self._ahead(edge, pose)
 
     def choose(self, edge: str, pose: Pose) -> Walk | None:
         """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
         if edge.startswith(":"):
-            around = self._inside(edge)
-            firsts = self._into.get(around, [])
-        elif edge in self._ends:
-            around = self._ahead(edge, pose)
-            firsts = [edge]
-        else:
-            return None
-        fallback: Walk | None = None
-        for first in firsts:
-            for second in self._at.get(around, []):
-                if second == first:
-                    continue
-                if self._ends[second] != self._ends[first][::-1]:
-                    return Walk(around, first, second)
-                fallback = fallback or Walk(around, first, second)
-        return fallback
+            if edge not in self._best:
+                around = self._inside(edge)
+                walk = self._pair(around, self._into.get(around, []), edge)
+                lost = walk is not None and edge in self._place and self._touched(walk, edge) == 0
+                self._best[edge] = None if lost else walk
+            return self._best[edge]
+        if edge in self._ends:
+            return self._pair(self._ahead(edge, pose), [edge], edge)
+        return None
+
+    def _pair(self, around: str, firsts: list[str], edge: str) -> Walk | None:
+        """The walk that touches most corners of `edge`, if possible not from one side of a street to its other."""
+        walks = [Walk(around, first, to) for first in firsts for to in self._at.get(around, []) if to != first]
+        return max(
+            walks,
+            key=lambda walk: (self._touched(walk, edge), self._ends[walk.second] != self._ends[walk.first][::-1]),
+            default=None,
+        )
+
+    def _touched(self, walk: Walk, edge: str) -> int:
+        """How many corners of a corner or crossing the walk's sidewalks touch. SUMO crashes where they touch none."""
+        strips = self.street_map.strips
+        corners = strips[edge].corners if edge in strips else (edge,)
+        return sum(
+            corner is not None and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
+            for corner in corners
+        )
 
     def _inside(self, edge: str) -> str:
         """The meeting place of a corner or crossing; the junction of any other edge inside one."""

@@ -12,12 +12,15 @@ from collections.abc import Sequence
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from shapely.geometry import Polygon
+from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.geometry import Floats
 
 REACH_M = 2.5
 """How far beyond its end a strip may look for its corner."""
+
+WELD_M = 0.005
+"""Wedges are grown by this much, so that they and the strip become one polygon."""
 
 Polygons = NDArray[np.object_]
 
@@ -54,9 +57,12 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     met = shapely.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
     hulls = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
-    wedges = shapely.difference(hulls, corners)
-    grown = shapely.union(polygons, wedges)
-    whole = shapely.get_type_id(grown) == 3
+    wedges = shapely.buffer(shapely.difference(hulls, corners), WELD_M, join_style="mitre")
     out: Polygons = polygons.copy()
-    out[wanted & whole] = grown[wanted & whole]
+    out[wanted] = [_largest(shape) for shape in shapely.union(polygons, wedges)[wanted]]
     return out
+
+
+def _largest(shape: Polygon | MultiPolygon) -> Polygon:
+    """The largest part of a shape: slivers of a wedge on the far side of a corner are nothing."""
+    return shape if isinstance(shape, Polygon) else max(shape.geoms, key=lambda part: part.area)

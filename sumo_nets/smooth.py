@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cosim.geometry import Floats, wrap_angles
+from sumo_nets.giveway import Body, stepped_round
 
 MAX_SPEED_MPS = 2.2
 """The fastest a shown person moves: above every walking speed, so that it catches up."""
@@ -36,10 +37,12 @@ class PoseFilter:
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
 
-    def update(self, ids: tuple[str, ...], xy: Floats, heading: Floats, speed: Floats) -> tuple[Floats, Floats, Floats]:
+    def update(
+        self, ids: tuple[str, ...], xy: Floats, heading: Floats, speed: Floats, body: Body | None = None
+    ) -> tuple[Floats, Floats, Floats]:
         """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
 
-        Who is new is shown as simulated; who is missing is forgotten.
+        Who is new is shown as simulated; who is missing is forgotten. body: the robot, round which people step.
         """
         row = np.array([self._index.get(name, -1) for name in ids], dtype=np.intp)
         known = row >= 0
@@ -52,6 +55,8 @@ class PoseFilter:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
+        if body is not None:
+            shown = stepped_round(before, shown, body.pose, body.half_m)
         velocity = np.where(known[:, None], (shown - before) / self.period_s, simulated)
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
 

@@ -1,0 +1,49 @@
+"""People step round the robot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from cosim.geometry import Pose, box_disk_gap
+from sumo_nets.giveway import KEEP_M, stepped_round
+
+HALF = (0.36, 0.29)
+STEP_M = 1.4 * 0.05
+
+
+def gap(xy: np.ndarray, robot: Pose) -> float:
+    return float(box_disk_gap(np.array([robot]), *HALF, xy[None])[0, 0]) - 0.3
+
+
+@pytest.mark.parametrize("aside_m", [0.0, 0.05, -0.3, 0.6])
+@pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2])
+def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_m: float, heading: float) -> None:
+    """From any lateral offset and against any heading the walker gets to the other side and never overlaps."""
+    robot = Pose(0.0, 0.0, heading)
+    xy, goal = np.array([[4.0, aside_m]]), np.array([[-4.0, aside_m]])
+    nearest = math.inf
+    for _ in range(250):
+        away = goal - xy
+        far = max(float(np.hypot(*away[0])), 1e-9)
+        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), robot, HALF)
+        nearest = min(nearest, gap(xy, robot))
+    assert nearest > 0.0
+    assert float(np.hypot(*(goal - xy)[0])) < 0.2
+
+
+def test_a_robot_that_drives_at_somebody_hits_them() -> None:
+    """Only a person's own steps are changed: who stands still is not moved out of the robot's way."""
+    person = np.array([[1.0, 0.0]])
+    for x_m in np.arange(0.0, 0.8, 0.1):
+        assert np.array_equal(stepped_round(person, person, Pose(x_m, 0.0, 0.0), HALF), person)
+    assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
+
+
+def test_people_who_are_not_near_walk_as_they_want() -> None:
+    """Far from the robot, beside it, and walking away from it nothing changes."""
+    before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + KEEP_M + 0.05], [0.7, 0.0]])
+    wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
+    assert np.allclose(stepped_round(before, wanted, Pose(0.0, 0.0, 0.0), HALF), wanted)
