@@ -76,9 +76,7 @@ class Walks:
         if edge.startswith(":"):
             if edge not in self._best:
                 around = self._inside(edge)
-                walk = self._pair(around, self._into.get(around, []), edge)
-                lost = walk is not None and edge in self._place and self._touched(walk, edge) == 0
-                self._best[edge] = None if lost else walk
+                self._best[edge] = self._pair(around, self._into.get(around, []), edge)
             return self._best[edge]
         if edge in self._ends:
             return self._pair(self._ahead(edge, pose), [edge], edge)
@@ -94,7 +92,7 @@ class Walks:
         )
 
     def _touched(self, walk: Walk, edge: str) -> int:
-        """How many corners of a corner or crossing the walk's sidewalks touch. SUMO crashes where they touch none."""
+        """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its path there."""
         strips = self.street_map.strips
         corners = strips[edge].corners if edge in strips else (edge,)
         return sum(
