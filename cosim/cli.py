@@ -11,6 +11,7 @@ import pandas as pd
 import typer
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -53,7 +54,7 @@ COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`"
 )
 def run(
-    suite: Annotated[str, typer.Argument(help="A suite; `cosim list` shows them.")],
+    suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
@@ -86,7 +87,7 @@ def run(
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = folder or Path("runs") / f"{suite}-{manifest.name}-{stamp}"
+    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
     held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
     with held:
         done = held.finished()
@@ -107,6 +108,8 @@ def run(
         table = held.finish()
     print_table(table, len(picked))
     out.print(f"Run folder: {path}", soft_wrap=True)
+    if (table["status"] == "crashed").any():
+        raise typer.Exit(1)
 
 
 @app.command("list")
@@ -176,7 +179,7 @@ def doctor() -> None:
             out.print(f"[green]ok[/]      {name}: {check()}", soft_wrap=True)
         except Exception as error:  # noqa: BLE001  a check may fail in any way; it is shown and counted
             failed += 1
-            out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {error}", soft_wrap=True)
+            out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {escape(str(error))}", soft_wrap=True)
     if failed:
         raise typer.Exit(1)
 
@@ -272,10 +275,10 @@ def main() -> None:
     try:
         app()
     except UsageError as error:
-        err.print(f"[red]error:[/] {error}", soft_wrap=True, highlight=False)
+        err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
         raise SystemExit(2) from None
     except CosimError as error:
-        err.print(f"[red]error:[/] {error}", soft_wrap=True, highlight=False)
+        err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
         raise SystemExit(1) from None
 
 

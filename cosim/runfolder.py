@@ -24,7 +24,7 @@ from typing import Self
 import msgspec
 import pandas as pd
 
-from cosim.errors import RunError
+from cosim.errors import RunError, unknown
 from cosim.record import Record
 from cosim.results import row_of, table_of
 from cosim.scenario import Scenario, Suite, read_suite, write_suite
@@ -151,11 +151,12 @@ class RunFolder:
 
 
 def read_spec(path: Path) -> RunSpec:
-    """What the run in a folder is. Raises RunError when it holds none."""
+    """What the run in a folder is. Raises UsageError, with the runs beside it, when it holds none."""
     try:
         return msgspec.json.decode((path / "run.json").read_bytes(), type=RunSpec)
     except FileNotFoundError:
-        raise RunError(f"{path} holds no run: there is no run.json in it.") from None
+        beside = [p.parent.name for p in path.parent.glob("*/run.json")] if path.parent.is_dir() else []
+        raise unknown("run", str(path), beside) from None
     except (OSError, msgspec.DecodeError) as error:
         raise RunError(f"{path / 'run.json'}: {error}") from error
 

@@ -15,9 +15,14 @@ SUITES: Mapping[str, Path] = MappingProxyType({"long-horizon": _HERE / "long-hor
 
 
 def suite(name: str) -> Suite:
-    """A shipped suite. Raises UsageError with the valid names."""
+    """A shipped suite by name, or one of the user's by the path of its .json file.
+
+    Raises UsageError with the valid names, SpecError naming the file and the field.
+    """
+    if name.endswith(".json"):
+        return read_suite(Path(name))
     if name not in SUITES:
-        raise unknown("suite", name, SUITES)
+        raise unknown("suite", name, [*SUITES, "path/to/suite.json"])
     return read_suite(SUITES[name])
 
 

@@ -51,4 +51,5 @@ def stepped_round(before: Floats, wanted: Floats, robot: Pose, half_m: tuple[flo
     around = tangent * (side * np.hypot(step[:, 0], step[:, 1]))[:, None]
     slides = (gap < KEEP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + around, near)
-    return moved @ turn.T + robot.xy
+    rounded: Floats = moved @ turn.T + robot.xy
+    return rounded

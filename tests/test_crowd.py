@@ -137,7 +137,12 @@ def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
     start = middle(place, signalised=True)
     spec = CrowdSpec(persons=80, radius_m=80.0, vehicles=10)
     strips = [strip for strip in place.map.strips.values() if strip.signalised]
-    inner = {s.id: s.polygon.difference(shapely.MultiPoint(s.line[[0, -1]]).buffer(2.2)) for s in strips}
+    inner = {
+        s.id: shapely.LineString(s.line)
+        .buffer(s.width_m / 2, cap_style="flat")
+        .difference(shapely.MultiPoint(s.line[[0, -1]]).buffer(2.2))
+        for s in strips
+    }
     entries: list[float] = []
     on: dict[str, str] = {}
     red_s: dict[str, float] = {}

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.errors import RunError
+from cosim.errors import RunError, UsageError
 from cosim.metrics import METRICS
 from cosim.record import Log, Record
 from cosim.results import summary_of, table_of
@@ -100,9 +100,10 @@ def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
-    """Showing what is no run folder says so."""
-    with pytest.raises(RunError, match="holds no run"):
-        read_records(tmp_path)
+    """What is no run folder is answered with the runs that lie beside it."""
+    RunFolder.create(tmp_path / "mine", SPEC, SUITE)
+    with pytest.raises(UsageError, match=r"unknown run .*other'\. Valid choices: mine"):
+        read_records(tmp_path / "other")
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b'{"scenario": 3}', b"\x80\x04pickle"])

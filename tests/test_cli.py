@@ -1,0 +1,263 @@
+"""The command line as a user runs it: real engines, real processes, real signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+import pytest
+
+from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from cosim.walks import WalkGraph
+
+pytestmark = pytest.mark.engine
+
+POLICIES = """
+import os, signal
+import numpy as np
+from cosim.ports import Manifest
+from cosim.state import Command
+
+class Base:
+    manifest = Manifest("base", camera=None)
+    def reset(self, scenario_id, seed):
+        self.scenario, self.count = scenario_id, 0
+    def act(self, observation):
+        self.count += 1
+        bad = self.scenario == "t-1" and self.count > 4
+        return self.answer() if bad else Command(1.0, 0.0)
+
+class Raises(Base):
+    def answer(self): raise KeyError("no such weight")
+class Nan(Base):
+    def answer(self): return np.array([[np.nan, 0.0]])
+class Shape(Base):
+    def answer(self): return np.zeros((3, 7))
+class Segfault(Base):
+    def answer(self): os.kill(os.getpid(), signal.SIGSEGV)
+class Slow(Base):
+    manifest = Manifest("slow", rate_hz=20.0, camera=None)
+    def act(self, observation):
+        import time; time.sleep(0.01); return Command(1.0, 0.0)
+class Unfinished: pass
+"""
+
+
+def cosim(*words: str, cwd: Path, timeout: float = 120.0) -> subprocess.CompletedProcess[str]:
+    """Run `cosim` and wait."""
+    command = [sys.executable, "-m", "cosim", *words]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=timeout, env=environment())
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder: a suite of three short scenarios and a module with policies."""
+    from scenarios.assemble import place
+    from scenarios.long_horizon import build
+
+    folder = tmp_path_factory.mktemp("desk")
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    graph = WalkGraph(street_map)
+    scenarios = []
+    for i in range(3):
+        whole = build(city, street_map, graph, i, f"t-{i}")
+        fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
+        crowd = CrowdSpec(persons=12, radius_m=50.0, vehicles=4)
+        scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 15.0}))
+    write_suite(Suite(name="tiny", version="1", scenarios=tuple(scenarios)), folder / "tiny.json")
+    (folder / "mine.py").write_text(POLICIES)
+    return folder
+
+
+def rows(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / "results.csv", index_col="scenario")
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {p.parent.name: json.loads(p.read_text())["state_hash"] for p in folder.glob("episodes/*/record.json")}
+
+
+def wait_for(condition, seconds: float = 60.0) -> None:  # type: ignore[no-untyped-def]
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def whole_run(desk: Path) -> Path:
+    """The tiny suite, run without interruption by one process, the camera on."""
+    done = cosim("run", "tiny.json", "--policy", "straight", "--out", "whole", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    return desk / "whole"
+
+
+def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, whole_run: Path) -> None:
+    """Rows, records, trajectories and specs are there, and `show` prints the same table again."""
+    table = rows(whole_run)
+    assert list(table.index) == ["t-0", "t-1", "t-2"]
+    assert set(table["status"]) == {"done"}
+    assert set(table["renderer"]) == {"bullet-tiny"}
+    for name in table.index:
+        assert (whole_run / "episodes" / name / "trajectory.npz").exists()
+    shown = cosim("show", "whole", cwd=desk)
+    assert shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, finished 3, crashed 0" in shown.stdout
+    one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
+    assert one.returncode == 0, one.stderr
+    assert (desk / "above.png").stat().st_size > 5000
+
+
+def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path, whole_run: Path) -> None:
+    """State hashes and rows are identical for one process and for three."""
+    assert cosim("run", "tiny.json", "--policy", "straight", "--jobs", "3", "--out", "three", cwd=desk).returncode == 0
+    assert hashes(desk / "three") == hashes(whole_run)
+    assert all(len(h) == 32 for h in hashes(whole_run).values())
+    assert len(set(hashes(whole_run).values())) == 3
+    assert (desk / "three/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+def test_an_interrupted_run_is_finished_by_resume(desk: Path, whole_run: Path, how: signal.Signals) -> None:
+    """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table is the same."""
+    out = desk / f"broken-{how.name}"
+    command = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "straight", "--out", out.name]
+    run = subprocess.Popen(command, cwd=desk, stderr=subprocess.PIPE, text=True, env=environment())
+    wait_for(lambda: (out / "episodes/t-0/record.json").exists())
+    wait_for(lambda: (out / "episodes").exists() and not (out / "episodes/t-1/record.json").exists())
+    run.send_signal(how)
+    said = run.communicate(timeout=30)[1]
+    if how == signal.SIGINT:
+        assert run.returncode == 130
+        assert f"--out {out.name} --resume" in said and "finished and kept" in said
+    kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
+    wait_for(lambda: not alive(out))
+    again = cosim("run", "tiny.json", "--policy", "straight", "--out", out.name, "--resume", cwd=desk)
+    assert again.returncode == 0, again.stderr
+    assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == kept
+    assert (out / "results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+def alive(out: Path) -> bool:
+    """Whether an environment process still writes to the logs of a run."""
+    logs = {str(p.resolve()) for p in out.glob("logs/*")}
+    for fd in Path("/proc").glob("[0-9]*/fd/1"):
+        try:
+            if str(fd.readlink()) in logs:
+                return True
+        except OSError:
+            continue
+    return False
+
+
+@pytest.mark.parametrize(
+    ("policy", "reason"),
+    [
+        ("Raises", "policy 'base' raised KeyError: 'no such weight'"),
+        ("Nan", "waypoints with NaN or infinity"),
+        ("Shape", "an array of shape (3, 7)"),
+        ("Segfault", "the environment process was killed by SIGSEGV"),
+    ],
+)
+def test_an_episode_that_crashes_is_recorded_and_the_run_goes_on(desk: Path, policy: str, reason: str) -> None:
+    """What goes wrong inside one episode becomes its reason; the episodes before and after it are done."""
+    out = desk / f"crash-{policy}"
+    run = cosim("run", "tiny.json", "--policy", f"mine:{policy}", "--out", out.name, cwd=desk)
+    table = rows(out)
+    assert list(table["status"]) == ["done", "crashed", "done"]
+    assert reason in table.loc["t-1", "reason"]
+    assert run.returncode == 1 and "crashed t-1" in run.stdout and reason in run.stdout
+    assert table.loc["t-1", "success"] == 0.0
+
+
+def test_a_second_run_on_the_same_folder_is_refused(desk: Path) -> None:
+    """While a run is going on its folder is locked, and afterwards it is not overwritten."""
+    command = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "mine:Slow", "--out", "held"]
+    run = subprocess.Popen(command, cwd=desk, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment())
+    try:
+        wait_for(lambda: (desk / "held/results.sqlite").exists())
+        second = cosim("run", "tiny.json", "--policy", "mine:Slow", "--out", "held", "--resume", cwd=desk)
+        assert second.returncode == 1
+        assert f"in use by process {run.pid}" in second.stderr
+        third = cosim("run", "tiny.json", "--policy", "mine:Slow", "--out", "held", cwd=desk)
+        assert third.returncode == 1 and "already holds a run. Add --resume" in third.stderr
+    finally:
+        run.kill()
+        run.wait()
+
+
+def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, whole_run: Path) -> None:
+    """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid choices."""
+    asked = {
+        ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
+        ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "route, stop, straight"),
+        ("run", "tiny.json", "--policy", "mine:Nam"): ("'Nam'", "Nan"),
+        ("run", "tiny.json", "--policy", "nowhere:X"): ("module 'nowhere' cannot be imported", "ModuleNotFoundError"),
+        ("run", "tiny.json", "--policy", "mine:Unfinished"): ("'mine:Unfinished' has no attribute 'manifest'", ""),
+        ("run", "tiny.json", "--scenario", "t-9"): ("scenario 't-9'", "t-0, t-1, t-2"),
+        ("run", "tiny.json", "--resume"): ("--resume needs --out", ""),
+        ("show", "whole", "--episode", "t-9"): ("'t-9'", "t-0, t-1, t-2"),
+        ("show", "nothing"): ("run 'nothing'", "crash" if (desk / "crash-Nan").exists() else "whole"),
+        ("list", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
+    }
+    for words, (name, choices) in asked.items():
+        said = cosim(*words, cwd=desk)
+        assert said.returncode == 2, (words, said.stderr)
+        assert name in said.stderr and choices in said.stderr, (words, said.stderr)
+        assert "Traceback" not in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"route": [[0, 0]]}, "route needs two points"),
+        ({"goal": [1.0, 2.0]}, "is not the route's end"),
+        ({"time_limit_s": "long"}, "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`"),
+        ({"crowd": {"persons": -1}}, "persons and vehicles cannot be negative"),
+        ({"schema": 99}, "has schema 99"),
+    ],
+)
+def test_a_broken_suite_file_is_named_with_its_field(desk: Path, change: dict[str, object], message: str) -> None:
+    """A scenario file that contradicts itself is refused before anything runs."""
+    suite = json.loads((desk / "tiny.json").read_text())
+    suite["scenarios"][0] |= change
+    (desk / "bad.json").write_text(json.dumps(suite))
+    said = cosim("run", "bad.json", "--out", "bad", cwd=desk)
+    assert said.returncode == 1 and "bad.json" in said.stderr and message in said.stderr
+    assert not (desk / "bad").exists()
+
+
+def test_a_suite_of_another_city_is_refused(desk: Path) -> None:
+    """A scenario made on another street net is a crash with the remedy, not a wrong result."""
+    suite = json.loads((desk / "tiny.json").read_text())
+    suite["scenarios"] = suite["scenarios"][:1]
+    suite["scenarios"][0]["place"]["net_hash"] = "0" * 16
+    (desk / "other.json").write_text(json.dumps(suite))
+    said = cosim("run", "other.json", "--policy", "stop", "--out", "other", cwd=desk)
+    assert said.returncode == 1 and "the net's hash is" in said.stdout
+
+
+def test_the_doctor_finds_every_engine_well(desk: Path) -> None:
+    """`cosim doctor` draws a frame, walks people, asks a director, and says so."""
+    said = cosim("doctor", cwd=desk)
+    assert said.returncode == 0, said.stdout
+    assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
+
+
+def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:
+    """Suite and scenario hash, seed, policy, renderer and the version of every engine are in each record."""
+    record = msgspec.json.decode((whole_run / "episodes/t-0/record.json").read_bytes())
+    assert {"libsumo", "pybullet", "eclipse-zenoh", "numpy"} <= set(record["versions"])
+    for field in ("suite_hash", "scenario_hash", "seed", "policy", "policy_version", "renderer", "state_hash"):
+        assert record[field] not in ("", None)
