@@ -125,7 +125,7 @@ class SumoCrowd(Crowd):
             self._robot.update(robot.pose)
             self._mirror(reply.actors)
             libsumo.simulationStep()
-            body = Body(robot.pose, self._half_m)
+            body = Body(robot.pose, self._half_m, robot.v_mps)
             self._street = self._read(tick + 1, x_m, y_m, reply.actors, body)
         return self._street
 

@@ -18,38 +18,57 @@ KEEP_M = 0.12
 """Gap between a person's disk and the robot's outline at which the person begins to step round."""
 
 
+FORESEEN_S = 0.6
+"""How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
+
+
 class Body(NamedTuple):
-    """The robot as people see it: its pose, and half its length and width in metres."""
+    """The robot as people see it: its pose, half its length and width in metres, its speed."""
 
     pose: Pose
     half_m: tuple[float, float]
+    v_mps: float = 0.0
 
 
-def stepped_round(before: Floats, wanted: Floats, robot: Pose, half_m: tuple[float, float]) -> Floats:
+def stepped_round(before: Floats, wanted: Floats, body: Body) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
 
-    half_m: half length and half width of the robot. A step towards the robot from nearer than KEEP_M loses its
+    People keep out of the ground that a moving robot is about to cover, too: who walks against it there steps aside.
+    Apart from that a step towards the robot from nearer than KEEP_M loses its
     inward part; its length goes into the way round: to the side on which the step would pass the robot's centre.
     That choice strengthens itself, so nobody dithers.
     """
-    c, s = np.cos(robot.heading_rad), np.sin(robot.heading_rad)
-    turn = np.array([[c, -s], [s, c]])
-    limit = np.array(half_m)
-    near = (wanted - robot.xy) @ turn
-    gap = np.hypot(*np.maximum(np.abs(near) - limit, 0.0).T) - PERSON_RADIUS_M
-    if not (gap < KEEP_M).any():
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    length, width = body.half_m
+    ahead = FORESEEN_S * max(body.v_mps, 0.0)
+    low, high = np.array([-length, -width]), np.array([length, width])
+    reach = np.array([ahead, 0.0])
+    near = (wanted - body.pose.xy) @ turn
+    if not (_gap(near, low, high + reach) < KEEP_M).any():
         return wanted
-    local = (before - robot.xy) @ turn
-    out = local - np.clip(local, -limit, limit)
+    local = (before - body.pose.xy) @ turn
+    step = near - local
+    pace = np.hypot(step[:, 0], step[:, 1])
+    side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
+
+    out = local - np.clip(local, low, high)
     far = np.hypot(out[:, 0], out[:, 1])
     normal = out / np.maximum(far, 1e-9)[:, None]
-    step = near - local
     inward = -(step * normal).sum(axis=1)
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    about = local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0]
-    side = np.where(about >= 0.0, 1.0, -1.0)
-    around = tangent * (side * np.hypot(step[:, 0], step[:, 1]))[:, None]
-    slides = (gap < KEEP_M) & (inward > 0.0) & (far > 1e-6)
-    moved = np.where(slides[:, None], local + around, near)
-    rounded: Floats = moved @ turn.T + robot.xy
+    slides = (_gap(near, low, high) < KEEP_M) & (inward > 0.0) & (far > 1e-6)
+    moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
+
+    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < KEEP_M)
+    aside = np.where(local[:, 1] >= 0.0, pace, -pace)
+    moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
+    rounded: Floats = moved @ turn.T + body.pose.xy
     return rounded
+
+
+def _gap(points: Floats, low: Floats, high: Floats) -> Floats:
+    """Distance from people's disks to a box that is square to the axes, (N,) metres."""
+    away = points - np.clip(points, low, high)
+    gap: Floats = np.hypot(away[:, 0], away[:, 1]) - PERSON_RADIUS_M
+    return gap

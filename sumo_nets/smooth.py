@@ -56,7 +56,7 @@ class PoseFilter:
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
         if body is not None:
-            shown = stepped_round(before, shown, body.pose, body.half_m)
+            shown = stepped_round(before, shown, body)
         velocity = np.where(known[:, None], (shown - before) / self.period_s, simulated)
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
 

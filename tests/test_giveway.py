@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.geometry import Pose, box_disk_gap
-from sumo_nets.giveway import KEEP_M, stepped_round
+from sumo_nets.giveway import KEEP_M, Body, stepped_round
 
 HALF = (0.36, 0.29)
 STEP_M = 1.4 * 0.05
@@ -28,7 +28,7 @@ def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_
     for _ in range(250):
         away = goal - xy
         far = max(float(np.hypot(*away[0])), 1e-9)
-        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), robot, HALF)
+        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), Body(robot, HALF))
         nearest = min(nearest, gap(xy, robot))
     assert nearest > 0.0
     assert float(np.hypot(*(goal - xy)[0])) < 0.2
@@ -38,7 +38,7 @@ def test_a_robot_that_drives_at_somebody_hits_them() -> None:
     """Only a person's own steps are changed: who stands still is not moved out of the robot's way."""
     person = np.array([[1.0, 0.0]])
     for x_m in np.arange(0.0, 0.8, 0.1):
-        assert np.array_equal(stepped_round(person, person, Pose(x_m, 0.0, 0.0), HALF), person)
+        assert np.array_equal(stepped_round(person, person, Body(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person)
     assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
 
 
@@ -46,4 +46,23 @@ def test_people_who_are_not_near_walk_as_they_want() -> None:
     """Far from the robot, beside it, and walking away from it nothing changes."""
     before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + KEEP_M + 0.05], [0.7, 0.0]])
     wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
-    assert np.allclose(stepped_round(before, wanted, Pose(0.0, 0.0, 0.0), HALF), wanted)
+    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF)), wanted)
+
+
+def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
+    """A person and a robot at 1.5 m/s meet head-on: the person gets out of its way before they touch."""
+    xy = np.array([[6.0, 0.1]])
+    nearest = math.inf
+    for tick in range(80):
+        robot = Pose(1.5 * 0.05 * tick, 0.0, 0.0)
+        xy = stepped_round(xy, xy - np.array([[STEP_M, 0.0]]), Body(robot, HALF, 1.5))
+        nearest = min(nearest, gap(xy, Pose(1.5 * 0.05 * (tick + 1), 0.0, 0.0)))
+    assert nearest > 0.0
+    assert float(xy[0, 0]) < 1.5 * 0.05 * 80 - 1.0
+
+
+def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
+    """A slower person in front keeps walking and is run into: the robot has to watch out."""
+    before = np.array([[0.8, 0.0]])
+    wanted = before + np.array([[0.03, 0.0]])
+    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)

@@ -84,8 +84,10 @@ def bearing_to(known: Privileged, offset_m: float) -> float:
     x, y, heading = known.robot.pose
     look_m = LOOK_AHEAD_M if known.route_s_m + LOOK_AHEAD_M < known.route.length_m else 0.8
     ahead = known.route.at(min(known.route_s_m + look_m, known.route.length_m))
-    target_x = ahead.x_m - offset_m * math.sin(ahead.heading_rad)
-    target_y = ahead.y_m + offset_m * math.cos(ahead.heading_rad)
+    lateral_m, shift_m = lateral_of(known), SHIFT_M_PER_M * look_m
+    lane_m = lateral_m + max(-shift_m, min(shift_m, offset_m - lateral_m))
+    target_x = ahead.x_m - lane_m * math.sin(ahead.heading_rad)
+    target_y = ahead.y_m + lane_m * math.cos(ahead.heading_rad)
     return wrap_angle(math.atan2(target_y - y, target_x - x) - heading)
 
 
