@@ -27,8 +27,8 @@ check: .venv/dev.stamp
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 
-bench: .venv/dev.stamp
-	@$(BIN)/python -m bench
+bench: .venv/run.stamp
+	@$(BIN)/cosim bench
 
 .venv/pip.stamp:
 	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 is needed: no '$(PYTHON)' here. Name yours: make PYTHON=/path/to/python3.11"; exit 1; }

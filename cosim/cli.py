@@ -184,6 +184,34 @@ def doctor() -> None:
         raise typer.Exit(1)
 
 
+@app.command(epilog="Example:  \n`cosim bench --rounds 5`")
+def bench(
+    rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
+) -> None:
+    """Measure speed and memory of one environment process, part by part."""
+    from scenarios.bench import PARTS, measure, spread
+
+    with err.status("measuring ...") as status:
+        report = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
+    rows: list[tuple[str, list[float], str]] = [
+        ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
+        ("first frame of the cached city, s", report.first_frame_s, "<= 5"),
+        ("resident memory, MiB", [d.memory_mib for d in report.big], "<= 1024"),
+        ("cost of a step: 2 km / 0.5 km", report.growth(), "about 1"),
+        ("director's round trip, ms", [d.round_trip_ms for d in report.big], "<= 0.4"),
+        ("persons shown", [float(d.people) for d in report.big], ""),
+    ]
+    for name, values, target in rows:
+        table.add_row(name, *spread(values), target)
+    out.print(table)
+    parts = Table("part", "ms per simulated second", "spread", "share inside the engine")
+    for part in PARTS:
+        inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
+        parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
+    out.print(parts)
+
+
 class Board:
     """The progress display of a run: one bar for the suite, one for each episode under way."""
 

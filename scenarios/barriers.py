@@ -47,10 +47,10 @@ def barrier_at(street_map: StreetMap, port: Port) -> Barrier:
     pose = line.at(max(into_m, 0.0))
     back_m = min(into_m, 0.0)
     return Barrier(
-        x_m=pose.x_m + back_m * math.cos(pose.heading_rad),
-        y_m=pose.y_m + back_m * math.sin(pose.heading_rad),
-        heading_rad=pose.heading_rad,
-        length_m=strip.width_m + 2 * OVERHANG_M,
+        x_m=round(pose.x_m + back_m * math.cos(pose.heading_rad), 3),
+        y_m=round(pose.y_m + back_m * math.sin(pose.heading_rad), 3),
+        heading_rad=round(pose.heading_rad, 5),
+        length_m=round(strip.width_m + 2 * OVERHANG_M, 3),
         strip=port.strip,
         end=port.end,
         thickness_m=THICKNESS_M,

@@ -63,7 +63,7 @@ def _draw(
     scenario_id: str,
 ) -> Scenario:
     way, start_m, goal_m = draw_way(street_map, graph, rng, candidates)
-    route = way_line(street_map, way, start_m, goal_m)
+    route = Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 3))
     if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
         raise SpecError("length of the line does not fit")
     barriers = tuple(barrier_at(street_map, port) for port in branches(street_map, way))

@@ -22,12 +22,12 @@ SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])
 
 OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
 TIMES_S = np.linspace(0.25, 3.5, 14)
-SHIFT_M_PER_M = 0.4
-SHIFT_AFTER_M = 0.2
+SHIFT_M_PER_M = 0.35
+SHIFT_AFTER_M = 0.3
 """Changing lanes: sideways metres per metre driven, and metres until it begins to show."""
 
-LOOK_AHEAD_M = 1.4
-GAIN_P_PER_S = 1.5
+LOOK_AHEAD_M = 1.2
+GAIN_P_PER_S = 2.4
 GAIN_D = 0.12
 W_RADPS = 0.65
 BRAKE_MPS2 = 1.2
@@ -39,7 +39,13 @@ HALF_LENGTH_M = 0.35
 BODY_RADIUS_M = 0.33
 """The body as two disks, fore and aft."""
 
-CLEARANCE_M = 0.25
+CLEARANCE_M = 0.3
+TIGHT_M = 0.1
+OFFSET_COST = 0.25
+CHANGE_COST = 0.5
+NEARNESS_COST = 15.0
+"""Costs in m/s of speed given up: per metre beside the route, per metre of change, per metre too near."""
+
 PATIENCE_S = 3.0
 SEEN_M = 11.0
 
@@ -68,8 +74,7 @@ class Route:
         limit_mps = min(crossing_limit(known), CRUISE_MPS)
         held = limit_mps < 0.1
         self._stopped_s = 0.0 if observation.v_mps > 0.1 or held else self._stopped_s + dt_s
-        clearance_m = CLEARANCE_M if self._stopped_s < PATIENCE_S else 0.05
-        self._offset_m, free_mps = best_lane(known, self._offset_m, clearance_m)
+        self._offset_m, free_mps = best_lane(known, self._offset_m, patient=self._stopped_s < PATIENCE_S)
 
         bearing_rad = bearing_to(known, self._offset_m)
         rate_radps = (bearing_rad - self._bearing_rad) / dt_s
@@ -124,11 +129,12 @@ def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
     return bool((near & cannot_stop & (vehicles.speed > 0.5)).any())
 
 
-def best_lane(known: Privileged, current_m: float, clearance_m: float) -> tuple[float, float]:
+def best_lane(known: Privileged, current_m: float, *, patient: bool) -> tuple[float, float]:
     """(offset, speed): the lane beside the route worth taking and the speed to drive on it, 0 to wait.
 
-    Of the plans that keep `clearance_m` from everyone, the fastest on the nearest lane; when none does, not even
-    waiting, the one that keeps farthest away.
+    The fastest plan wins, less what it costs to leave the route, to change the lane, and to come nearer to anyone than
+    a clearance. Waiting is a plan like the others: it is no good when somebody walks straight at the robot. One that
+    has waited long takes any lane and a smaller clearance.
     """
     centres, velocities, radii = obstacles(known)
     if not len(centres):
@@ -137,10 +143,9 @@ def best_lane(known: Privileged, current_m: float, clearance_m: float) -> tuple[
     gaps = smallest_gaps(paths, known.robot.pose.heading_rad, centres, velocities, radii)
     inside = np.asarray(shapely.contains_xy(known.free, paths[:, 0, :, 0], paths[:, 0, :, 1])).all(axis=1)
     gaps[~inside & (OFFSETS_M != 0.0), :-1] = -np.inf
-    effort = 0.25 * np.abs(OFFSETS_M) + 0.3 * np.abs(OFFSETS_M - current_m)
-    score = np.where(gaps >= clearance_m, SPEEDS_MPS - effort[:, None], -np.inf)
-    if not np.isfinite(score).any():
-        score = gaps - 0.05 * effort[:, None]
+    clearance_m, effort_cost = (CLEARANCE_M, 1.0) if patient else (TIGHT_M, 0.1)
+    effort = OFFSET_COST * np.abs(OFFSETS_M) + CHANGE_COST * np.abs(OFFSETS_M - current_m)
+    score = SPEEDS_MPS - effort_cost * effort[:, None] - NEARNESS_COST * np.maximum(clearance_m - gaps, 0.0)
     lane, speed = np.unravel_index(int(np.argmax(score)), score.shape)
     return float(OFFSETS_M[lane]), float(SPEEDS_MPS[speed])
 

@@ -1,0 +1,189 @@
+"""What `cosim bench` measures: speed and memory of one environment process, part by part.
+
+Every figure is taken in a process of its own, several rounds in turn; medians are shown. Beside the time of a part
+stands the share that its engine spends inside its own step or picture: what is left is ours, and the engine's share
+is the limit. Shares and ratios hold when the machine is slow; times do not.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import resource
+import statistics
+import time
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+from cosim.policies.route import Route
+from cosim.ports import Camera, CameraSpec, Crowd, Director, Manifest, Policy, World
+from cosim.scenario import City, CrowdSpec, Scenario
+from cosim.step import Reset, Step
+
+MEASURED_S = 60.0
+WARM_UP_S = 5.0
+PARTS = ("crowd", "physics", "camera", "policy", "bridge", "referee", "loop")
+
+
+class FourHertz(Route):
+    """The route policy at the rate and with the camera of the figures."""
+
+    manifest = Manifest("route-4hz", rate_hz=4.0, camera=CameraSpec(96, 96), privileged=True)
+
+
+class Spent(defaultdict[str, float]):
+    """Seconds spent in each part."""
+
+    def timed(self, part: str, work: Callable[..., Any]) -> Callable[..., Any]:
+        """`work`, with its time added to `part`."""
+
+        def run(*args: Any, **named: Any) -> Any:
+            began = time.perf_counter()
+            try:
+                return work(*args, **named)
+            finally:
+                self[part] += time.perf_counter() - began
+
+        return run
+
+
+class Timed:
+    """An engine behind its port, with a stopwatch on one method."""
+
+    def __init__(self, engine: object, method: str, part: str, spent: Spent) -> None:
+        self._engine = engine
+        self._methods = {method: spent.timed(part, getattr(engine, method))}
+
+    def __getattr__(self, name: str) -> Any:
+        return self._methods.get(name) or getattr(self._engine, name)
+
+
+class Drive(NamedTuple):
+    """One drive. ms: wall milliseconds per simulated second of each part; engine_ms: of them, inside the engine."""
+
+    ms: dict[str, float]
+    engine_ms: dict[str, float]
+    factor: float
+    memory_mib: float
+    people: int
+    round_trip_ms: float
+
+
+def scenario_in(size_m: float) -> Scenario:
+    """A long-horizon scenario with 50 persons and 20 vehicles in a city of a size."""
+    from cosim.walks import WalkGraph
+    from scenarios.assemble import place
+    from scenarios.long_horizon import build
+
+    city = City(seed=5, size_m=size_m)
+    _, street_map = place(city)
+    whole = build(city, street_map, WalkGraph(street_map), 7, "bench")
+    fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
+    return Scenario(**fields | {"crowd": CrowdSpec(persons=50, radius_m=80.0, vehicles=20)})
+
+
+def drive(size_m: float) -> Drive:
+    """Drive for MEASURED_S simulated seconds in a city of a size."""
+    import physics.limits
+    import sumo_nets.limits
+    from cosim.loop import Parts, steps
+    from cosim.record import Recorder
+    from cosim.referee import Referee
+    from scenarios.assemble import staged
+
+    scenario, spent, engine = scenario_in(size_m), Spent(float), Spent(float)
+    physics.limits.put_stopwatch(engine.timed)
+    sumo_nets.limits.put_stopwatch(engine.timed)
+    with staged(scenario, FourHertz()) as stage:
+        parts, clock = stage.parts, stage.clock
+        timed = Parts(
+            cast(World, Timed(parts.world, "step", "physics", spent)),
+            cast(Crowd, Timed(parts.crowd, "step", "crowd", spent)),
+            cast(Director, Timed(parts.director, "react", "bridge", spent)),
+            cast(Policy, Timed(parts.policy, "act", "policy", spent)),
+            cast(Camera, Timed(parts.camera, "render", "camera", spent)),
+            parts.limits,
+            parts.free,
+        )
+        referee, recorder = Referee(scenario, stage.area, parts.world.footprint_m, clock), Recorder(clock.tick_s)
+
+        def score(step: Step) -> Reset | None:
+            verdict = referee.judge(step)
+            recorder.add(step, verdict)
+            return verdict.reset
+
+        scored = spent.timed("referee", score)
+        run = steps(scenario, clock, timed)
+        step, began = next(run), 0.0
+        warm, last = clock.ticks(WARM_UP_S), clock.ticks(WARM_UP_S + MEASURED_S)
+        for tick in range(last):
+            if tick == warm:
+                spent.clear()
+                engine.clear()
+                began = time.perf_counter()
+            step = run.send(scored(step))
+        whole = time.perf_counter() - began
+    spent["loop"] = whole - sum(spent.values())
+    scale = 1000.0 / MEASURED_S
+    return Drive(
+        ms={part: seconds * scale for part, seconds in spent.items()},
+        engine_ms={part: seconds * scale for part, seconds in engine.items()},
+        factor=MEASURED_S / whole,
+        memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        people=len(step.street.people),
+        round_trip_ms=1000.0 * spent["bridge"] / (last - warm),
+    )
+
+
+def first_frame(size_m: float) -> float:
+    """Seconds from a new process to the first camera frame of a cached city, imports included."""
+    began = time.perf_counter()
+    from scenarios.assemble import staged
+
+    scenario = scenario_in(size_m)
+    with staged(scenario, FourHertz()) as stage:
+        assert stage.parts.camera is not None
+        stage.parts.camera.render(stage.parts.world.place(scenario.start_pose), stage.parts.crowd.street)
+        return time.perf_counter() - began
+
+
+class Report(NamedTuple):
+    """Every figure, one value per round. small: the same drive in a city of a sixteenth of the area."""
+
+    big: list[Drive]
+    small: list[Drive]
+    first_frame_s: list[float]
+
+    def growth(self) -> list[float]:
+        """Cost of a simulated second in the 2 km city over that in the 0.5 km city, round by round."""
+        return [small.factor / big.factor for big, small in zip(self.big, self.small, strict=True)]
+
+
+def measure(rounds: int, tell: Callable[[str], None]) -> Report:
+    """Take every figure `rounds` times, each in a fresh process."""
+    report = Report([], [], [])
+    for i in range(rounds):
+        tell(f"round {i + 1} of {rounds}")
+        report.big.append(alone(drive, 2000.0))
+        report.small.append(alone(drive, 500.0))
+        report.first_frame_s.append(alone(first_frame, 2000.0))
+    return report
+
+
+def alone(work: Callable[[float], Any], size_m: float) -> Any:
+    """Run `work(size_m)` in a fresh process."""
+    with multiprocessing.get_context("spawn").Pool(1, initializer=_quiet) as pool:
+        return pool.apply(work, (size_m,))
+
+
+def _quiet() -> None:
+    """Engines greet on stdout when they are imported; the table stands there."""
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 1)
+
+
+def spread(values: Sequence[float]) -> tuple[str, str]:
+    """(median, "low to high") of a figure, for a table."""
+    digits = 0 if statistics.median(values) >= 100 else 2
+    return f"{statistics.median(values):.{digits}f}", f"{min(values):.{digits}f} to {max(values):.{digits}f}"
