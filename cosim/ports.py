@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.events import EventQuery, EventReply
-from cosim.geometry import Floats, Polyline, Pose
-from cosim.scenario import Scenario
+from cosim.geometry import Polyline, Pose
 from cosim.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
 
 
@@ -118,15 +117,3 @@ class Director(Protocol):
     """Moves the event pedestrians."""
 
     def react(self, query: EventQuery) -> EventReply: ...
-
-
-class Sink(Protocol):
-    """Something that looks on while an episode runs."""
-
-    def progress(self, scenario: Scenario, time_s: float, route_s_m: float) -> None: ...
-
-
-__all__ = [
-    "Camera", "CameraSpec", "Crowd", "Director", "Floats", "Manifest", "Observation", "Policy", "Privileged",
-    "Sink", "World",
-]  # fmt: skip

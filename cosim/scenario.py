@@ -32,7 +32,19 @@ class City(msgspec.Struct, frozen=True, kw_only=True, tag="city", tag_field="kin
         return f"city-{self.style}-{self.size_m:g}m-{self.seed}"
 
 
-Place = City
+class CityMap(msgspec.Struct, frozen=True, kw_only=True, tag="map", tag_field="kind"):
+    """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
+
+    map: str
+    seed: int = 0
+    net_hash: str = ""
+
+    @property
+    def name(self) -> str:
+        return f"map-{self.map}"
+
+
+Place = City | CityMap
 
 
 class Barrier(msgspec.Struct, frozen=True, kw_only=True):

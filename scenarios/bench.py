@@ -14,6 +14,7 @@ import statistics
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 from cosim.policies.route import Route
@@ -179,7 +180,7 @@ def alone(work: Callable[[float], Any], size_m: float) -> Any:
 
 def _quiet() -> None:
     """Engines greet on stdout when they are imported; the table stands there."""
-    with open(os.devnull, "wb") as nowhere:
+    with Path(os.devnull).open("wb") as nowhere:
         os.dup2(nowhere.fileno(), 1)
 
 

@@ -1,0 +1,74 @@
+"""The house itself: names, floors of the wheel, exports, documents."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import entry_points, packages_distributions
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ROOMS = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+
+
+def test_every_top_level_name_is_ours() -> None:
+    """No other installed distribution owns one of our package names, and the console script is there."""
+    owners = packages_distributions()
+    for room in ROOMS:
+        assert set(owners.get(room, ["sidewalk-cosim"])) == {"sidewalk-cosim"}
+    assert [e.value for e in entry_points(group="console_scripts", name="cosim")] == ["cosim.cli:main"]
+
+
+def test_the_ground_floor_imports_no_engine() -> None:
+    """Everything in cosim/ can be imported without SUMO, PyBullet, Zenoh or any other room."""
+    modules = [
+        ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        for path in sorted((ROOT / "cosim").rglob("*.py"))
+        if path.name not in ("__init__.py", "__main__.py")
+    ]
+    code = (
+        f"import importlib, sys\nfor name in {modules!r}: importlib.import_module(name)\n"
+        "rooms = {'libsumo', 'traci', 'pybullet', 'zenoh', 'sumo_nets', 'physics', 'bridge', 'scenarios'}\n"
+        "print(sorted(rooms & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
+    assert said.stdout.strip() == "[]"
+
+
+@pytest.mark.engine
+def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
+    """The built wheel carries every module, each room's type marker, the robot and the suites, and nothing else."""
+    command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--wheel-dir", str(tmp_path), str(ROOT)]
+    subprocess.run(command, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("sidewalk_cosim-*.whl")
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for room in ROOMS:
+        assert f"{room}/py.typed" in names
+        for path in (ROOT / room).rglob("*.py"):
+            assert path.relative_to(ROOT).as_posix() in names
+    assert {"scenarios/suites/long-horizon.json", "physics/robots/courier.urdf"} <= names
+    assert not [n for n in names if n.split("/")[0] not in ROOMS and ".dist-info" not in n]
+
+
+def test_the_documents_name_files_that_exist() -> None:
+    """Every path and make target in the documents is there."""
+    makefile = (ROOT / "Makefile").read_text()
+    for name in ("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md"):
+        text = (ROOT / name).read_text()
+        for path in re.findall(r"`((?:cosim|sumo_nets|physics|bridge|scenarios|tests)/[\w./-]*)`", text):
+            assert (ROOT / path).exists(), f"{name} names {path}"
+        for target in re.findall(r"\bmake (\w+)", text):
+            if target in ("run", "test", "check", "bench"):
+                assert f"\n{target}:" in makefile
+
+
+def test_the_fake_names_of_files_are_not_to_be_found() -> None:
+    """No file is called utils, common, helpers or manager, and none is longer than 400 lines."""
+    for room in ROOMS:
+        for path in (ROOT / room).rglob("*.py"):
+            assert path.stem not in ("utils", "common", "helpers", "manager", "misc")
+            assert len(path.read_text().splitlines()) <= 400, path

@@ -1,0 +1,158 @@
+"""One sweep over everything that is registered: a scenario is tested by existing."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, Point, box
+
+from cosim.clock import Clock
+from cosim.control import Limits
+from cosim.errors import SpecError
+from cosim.geometry import Polyline
+from cosim.policies import POLICIES
+from cosim.ports import Privileged
+from cosim.scenario import Scenario, content_hash, read_suite, write_suite
+from cosim.state import NO_VEHICLES, NOBODY, RobotState
+from cosim.streetmap import Corner, Port, StreetMap, Strip, WalkableArea
+from cosim.walks import WalkGraph
+from scenarios.barriers import barrier_at, branches, fenced, prove_single_path
+from scenarios.behaviors import BEHAVIORS
+from scenarios.build import Proof
+from scenarios.catalog import SUITES, suite
+
+SCENARIOS = [scenario for name in SUITES for scenario in suite(name).scenarios]
+
+
+def test_the_long_horizon_suite_is_what_it_promises() -> None:
+    """At least ten scenarios in at least three cities, each longer than 100 m, each solved by the expert."""
+    whole = suite("long-horizon")
+    assert len(whole.scenarios) >= 10
+    assert len({s.place.name for s in whole.scenarios}) >= 3
+    proofs = msgspec.json.decode(SUITES["long-horizon"].with_suffix(".proof.json").read_bytes(), type=list[Proof])
+    proved = {proof.scenario: proof.scenario_hash for proof in proofs}
+    assert proved == {s.id: content_hash(s) for s in whole.scenarios}
+    for scenario in whole.scenarios:
+        assert scenario.route_line.length_m > 100.0
+        assert scenario.time_limit_s == max(300.0, scenario.route_line.length_m / 0.2)
+        assert scenario.crossings and scenario.place.net_hash
+
+
+def test_a_suite_survives_its_file(tmp_path: Path) -> None:
+    """Writing and reading a suite changes nothing, its hash included."""
+    whole = suite("long-horizon")
+    write_suite(whole, tmp_path / "s.json")
+    again = read_suite(tmp_path / "s.json")
+    assert again == whole and again.content_hash == whole.content_hash
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.id)
+def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
+    """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
+    from scenarios.assemble import place
+
+    _, street_map = place(scenario.place)
+    route = scenario.route_line
+    near = shapely.buffer(LineString(scenario.route), 200.0)
+    free = fenced(street_map.walkable_near(near), scenario.barriers)
+    part = next(p for p in shapely.get_parts(free) if p.covers(Point(route.points[0])))
+    assert part.covers(Point(route.points[-1]))
+    assert not [ring for ring in part.interiors if shapely.Polygon(ring).area > 0.25]
+    assert shapely.covers(shapely.buffer(near, -1.0), part)
+    assert WalkableArea(shapely.buffer(part, -0.3)).signed_distance(route.resampled(0.25).points).min() >= 0.0
+    assert {e.kind for e in scenario.events} <= set(BEHAVIORS)
+    for event in scenario.events:
+        at = route.at(event.route_s_m)
+        assert np.hypot(at.x_m - event.x_m, at.y_m - event.y_m) < 0.01
+    for crossing in scenario.crossings:
+        middle = route.at((crossing.enter_s_m + crossing.leave_s_m) / 2)
+        strip = street_map.strips[crossing.id]
+        assert strip.polygon.covers(Point(middle[:2])) and strip.signalised == crossing.signalised
+
+
+def cross_map() -> StreetMap:
+    """Four sidewalks of 40 m that meet at a corner of 4 m x 4 m in the middle."""
+    arms = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
+    strips = {}
+    for name, (dx, dy) in arms.items():
+        line = np.array([[2.0 * dx, 2.0 * dy], [42.0 * dx, 42.0 * dy]])
+        polygon = shapely.buffer(LineString(line), 1.6, cap_style="flat")
+        strips[name] = Strip(name, "sidewalk", line, 3.2, polygon, ("middle", None))
+    corner = Corner("middle", box(-2, -2, 2, 2), tuple(Port(name, 0) for name in arms))
+    return StreetMap("cross", (-42, -42, 42, 42), strips, {"middle": corner}, {}, {})
+
+
+def test_branches_are_the_ports_a_way_does_not_use() -> None:
+    """On a crossroads from west to east, north and south are closed."""
+    way = [Port("west", 0), Port("east", 0)]
+    assert branches(cross_map(), way) == [Port("north", 0), Port("south", 0)]
+
+
+def test_the_proof_refuses_an_open_branch_and_a_closed_way() -> None:
+    """Fences at every branch prove the path; a missing one and one across the way are refused with the reason."""
+    street_map = cross_map()
+    way = [Port("west", 0), Port("east", 0)]
+    route = Polyline([(-30, 0), (30, 0)])
+    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    part = prove_single_path(street_map, route, fences, way, 0.3)
+    assert part.covers(Point(30, 0)) and not part.covers(Point(0, 30))
+    across = barrier_at(street_map, Port("east", 0))
+    with pytest.raises(SpecError, match="start and goal are not connected"):
+        prove_single_path(street_map, route, [*fences, across], way, 0.3)
+    with pytest.raises(SpecError, match=r"nearer than 1\.70 m|narrower than 3\.40 m"):
+        prove_single_path(street_map, route, fences, way, 1.7)
+
+
+def test_the_proof_refuses_a_way_round_an_island() -> None:
+    """A hole in the walkable area leaves two ways: refused, and the place is named."""
+    street_map = cross_map()
+    island = box(-0.4, -0.4, 0.6, 0.6)
+    holed = Corner("middle", box(-2, -2, 2, 2).difference(island), street_map.corners["middle"].ports)
+    street_map = StreetMap("island", street_map.bounds, street_map.strips, {"middle": holed}, {}, {})
+    way = [Port("west", 0), Port("east", 0)]
+    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    with pytest.raises(SpecError, match=r"two ways remain: they lead round \(0\.1, 0\.1\)"):
+        prove_single_path(street_map, Polyline([(-30, 0), (30, 0)]), fences, way, 0.2)
+
+
+def test_a_fence_closes_its_whole_strip() -> None:
+    """Each port's fence cuts its strip from its corner."""
+    street_map = cross_map()
+    for name in street_map.strips:
+        free = fenced(street_map.walkable, [barrier_at(street_map, Port(name, 0))])
+        far = Point(street_map.strips[name].line[-1] * 0.9)
+        part = next(p for p in shapely.get_parts(free) if p.covers(far))
+        assert not part.covers(Point(0, 0))
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_policy_answers_within_its_manifest(name: str) -> None:
+    """Every shipped policy resets, acts and stays within the robot's limits on an empty street."""
+    from cosim.loop import ask
+    from cosim.ports import Observation
+
+    policy, limits = POLICIES[name](), Limits()
+    Clock.for_rate(policy.manifest.rate_hz)
+    route = Polyline([(0, 0), (50, 0)])
+    policy.reset("t", 0)
+    for tick in range(0, 200, 2):
+        robot = RobotState(route.at(tick * 0.05), 1.0)
+        known = Privileged(robot, route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2))
+        command = ask(policy, Observation(tick, tick * 0.05, None, 1.0, 0.0, known), limits)
+        assert 0.0 <= command.v_mps <= limits.v_mps and abs(command.w_radps) <= limits.w_radps
+
+
+def test_the_walking_graph_agrees_with_the_branches() -> None:
+    """With its branches closed, a way is the only one: the graph reaches nothing else."""
+    street_map = cross_map()
+    graph = WalkGraph(street_map)
+    closed = frozenset(branches(street_map, [Port("west", 0), Port("east", 0)]))
+    reach = graph.reach(Port("west", 1), closed)
+    assert {p.strip for p in reach.ports if np.isfinite(reach.to(p))} == {"west", "east"}
+    assert all(a != b for a, b in itertools.combinations(closed, 2))
