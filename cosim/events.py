@@ -47,7 +47,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
     """Where an event stands. phase: waiting (before its trigger), acting, or over. since_tick: in this phase.
 
-    aim_rad: the heading an actor has committed to, if it has.
+    aim_rad: the heading an actor has committed to, if it has. blocked_ticks: how long it has stood against the robot.
     """
 
     phase: Literal["waiting", "acting", "over"]
@@ -58,6 +58,7 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
     triggered_tick: int | None = None
     trigger_distance_m: float | None = None
     aim_rad: float | None = None
+    blocked_ticks: int = 0
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,7 +75,7 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
-    route_s_m: the robot's arc length on the reference route.
+    route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
     """
 
     episode: str
@@ -86,6 +87,8 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     robot_v_mps: float
     robot_w_radps: float
     route_s_m: float
+    robot_length_m: float
+    robot_width_m: float
     events: tuple[Event, ...]
     states: tuple[EventState, ...] = ()
 

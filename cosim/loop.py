@@ -63,7 +63,8 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
                 robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings, parts.free
             )
             command = ask(parts.policy, observe(tick, clock, robot, frame, known), parts.limits)
-        reply = parts.director.react(query(scenario, clock, tick, robot, route_s_m, states))
+        asked = query(scenario, clock, tick, robot, route_s_m, parts.world.footprint_m, states)
+        reply = parts.director.react(asked)
         street_after = parts.crowd.step(robot, reply)
         motion = parts.world.step(command, street, street_after, clock.substeps)
         route_s_after_m = place_on_route(route, motion.robot.pose, route_s_m)
@@ -101,6 +102,7 @@ def query(
     tick: int,
     robot: RobotState,
     route_s_m: float,
+    footprint_m: tuple[float, float],
     states: tuple[EventState, ...],
 ) -> EventQuery:
     """The question to the director at a tick."""
@@ -114,6 +116,8 @@ def query(
         robot_v_mps=robot.v_mps,
         robot_w_radps=robot.w_radps,
         route_s_m=route_s_m,
+        robot_length_m=footprint_m[0],
+        robot_width_m=footprint_m[1],
         events=scenario.events,
         states=states,
     )

@@ -12,10 +12,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
 from cosim.errors import SpecError
 from cosim.events import Actor, Event, EventQuery, EventReply, EventState
-from cosim.geometry import wrap_angle
+from cosim.geometry import Pose, wrap_angle
+from cosim.giveway import Body, stepped_round, touches
 from cosim.state import PERSON_RADIUS_M, Doing
 
 SHOWN_AHEAD_M = 60.0
@@ -27,6 +29,9 @@ LEAVES_M = 15.0
 
 COMMIT_M = 5.0
 """`frontal` aims at the robot's current position until this close, then keeps its line as people do."""
+
+GIVES_UP_S = 2.0
+"""How long a `frontal` pedestrian stands against a robot that it has run into before it goes round."""
 
 EDGE_GAP_M = 0.1
 LOOK_PERIOD_S = 4.0
@@ -114,18 +119,27 @@ def _edge_m(event: Event) -> float:
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
 
 
-def _walk_to(state: EventState, x_m: float, y_m: float, speed_mps: float, tick_s: float) -> EventState:
-    """One tick towards a point, facing it; exactly there when in reach."""
+def _walk_to(state: EventState, x_m: float, y_m: float, speed_mps: float, query: EventQuery) -> EventState:
+    """One tick towards a point, facing it, round the robot if that is in the way; exactly there when in reach."""
+    tick_s = query.tick_ms / 1000
     dx, dy = x_m - state.x_m, y_m - state.y_m
-    far_m, reach_m = math.hypot(dx, dy), speed_mps * tick_s
-    if far_m <= reach_m:
-        return msgspec.structs.replace(state, x_m=x_m, y_m=y_m)
-    return msgspec.structs.replace(
-        state,
-        x_m=state.x_m + dx / far_m * reach_m,
-        y_m=state.y_m + dy / far_m * reach_m,
-        heading_rad=_turned(state.heading_rad, math.atan2(dy, dx), tick_s),
-    )
+    far_m = math.hypot(dx, dy)
+    share = min(speed_mps * tick_s / max(far_m, 1e-9), 1.0)
+    wanted = (x_m, y_m) if share == 1.0 else (state.x_m + share * dx, state.y_m + share * dy)
+    heading = state.heading_rad if share == 1.0 else _turned(state.heading_rad, math.atan2(dy, dx), tick_s)
+    return _stepped(state, wanted, heading, query)
+
+
+def _stepped(state: EventState, wanted: tuple[float, float], heading_rad: float, query: EventQuery) -> EventState:
+    """The state one step on, with the step led round the robot."""
+    before, after = np.array([[state.x_m, state.y_m]]), np.array([wanted])
+    x_m, y_m = stepped_round(before, after, _robot(query))[0].tolist()
+    return msgspec.structs.replace(state, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
+
+
+def _robot(query: EventQuery) -> Body:
+    pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
+    return Body(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
 
 
 def _turned(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
@@ -147,9 +161,9 @@ def _obstructing_act(event: Event, state: EventState, query: EventQuery) -> Even
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
     if state.phase == "over":
         home = _obstructing_begin(event)
-        return _walk_to(state, home.x_m, home.y_m, event.speed_mps, tick_s)
+        return _walk_to(state, home.x_m, home.y_m, event.speed_mps, query)
     if (state.x_m, state.y_m) != (event.x_m, event.y_m):
-        return _walk_to(state, event.x_m, event.y_m, event.speed_mps, tick_s)
+        return _walk_to(state, event.x_m, event.y_m, event.speed_mps, query)
     phase = 2 * math.pi * (query.tick - state.since_tick) * tick_s / LOOK_PERIOD_S
     facing = event.heading_rad + math.pi + LOOK_SWING_RAD * math.sin(phase)
     return msgspec.structs.replace(state, heading_rad=_turned(state.heading_rad, facing, tick_s))
@@ -159,7 +173,8 @@ def _obstructing_doing(event: Event, state: EventState) -> Doing:
     return "look" if state.phase == "acting" else "stand"
 
 
-# --- frontal: walks straight at the robot's current position, commits to a line, passes and walks on --------------
+# --- frontal: walks straight at the robot's current position, commits to a line, passes and walks on; one that has
+# --- run into the robot does not push it: it stands, gives up, and goes round
 
 
 def _frontal_begin(event: Event) -> EventState:
@@ -168,19 +183,21 @@ def _frontal_begin(event: Event) -> EventState:
 
 def _frontal_act(event: Event, state: EventState, query: EventQuery) -> EventState:
     tick_s = query.tick_ms / 1000
+    step_m = event.speed_mps * tick_s
     dx, dy = query.robot_x_m - state.x_m, query.robot_y_m - state.y_m
     back_rad = event.heading_rad + math.pi
-    if state.phase == "acting" and dx * math.cos(back_rad) + dy * math.sin(back_rad) < -1.0:
+    passed = dx * math.cos(back_rad) + dy * math.sin(back_rad) < -1.0
+    if state.phase == "acting" and (passed or state.blocked_ticks * tick_s >= GIVES_UP_S):
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
     if state.phase == "over":
         heading = _turned(state.heading_rad, back_rad, tick_s)
-    elif state.aim_rad is not None:
-        heading = state.aim_rad
-    else:
-        heading = math.atan2(dy, dx)
-        if math.hypot(dx, dy) <= COMMIT_M:
-            state = msgspec.structs.replace(state, aim_rad=heading)
-    step_m = event.speed_mps * tick_s
+        onward = (state.x_m + math.cos(back_rad) * step_m, state.y_m + math.sin(back_rad) * step_m)
+        return _stepped(state, onward, heading, query)
+    if touches(np.array([state.x_m, state.y_m]), _robot(query)):
+        return msgspec.structs.replace(state, blocked_ticks=state.blocked_ticks + 1)
+    heading = state.aim_rad if state.aim_rad is not None else math.atan2(dy, dx)
+    if state.aim_rad is None and math.hypot(dx, dy) <= COMMIT_M:
+        state = msgspec.structs.replace(state, aim_rad=heading)
     return msgspec.structs.replace(
         state,
         x_m=state.x_m + math.cos(heading) * step_m,

@@ -52,7 +52,7 @@ def city() -> str:
 def bridge() -> str:
     query = EventQuery(
         episode="doctor", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0,
-        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, events=(),
+        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
     )  # fmt: skip
     with directed("doctor") as director:
         director.react(query)

@@ -22,12 +22,12 @@ import numpy as np
 from cosim.errors import EngineError
 from cosim.events import Actor, EventReply
 from cosim.geometry import Pose, heading_from_sumo
+from cosim.giveway import Body
 from cosim.ports import Crowd
 from cosim.scenario import CrowdSpec
 from cosim.state import People, RobotState, Street, Vehicles
 from cosim.streetmap import Port, StreetMap
 from sumo_nets.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
-from sumo_nets.giveway import Body
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
 from sumo_nets.smooth import PoseFilter

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from cosim.geometry import Floats, wrap_angles
-from sumo_nets.giveway import Body, stepped_round
+from cosim.giveway import Body, stepped_round
 
 MAX_SPEED_MPS = 2.2
 """The fastest a shown person moves: above every walking speed, so that it catches up."""

@@ -6,6 +6,7 @@ import itertools
 import math
 
 import msgspec
+import numpy as np
 import pytest
 
 from cosim.errors import SpecError
@@ -25,7 +26,8 @@ def ask(one: Event, tick: int, x_m: float, y_m: float = 0.0, states: tuple[Event
     """The reply to a robot on the x axis that faces +x."""
     query = EventQuery(
         episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=y_m, robot_heading_rad=0.0,
-        robot_v_mps=1.0, robot_w_radps=0.0, route_s_m=x_m, events=(one,), states=states,
+        robot_v_mps=1.0, robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=(one,),
+        states=states,
     )  # fmt: skip
     return react(query)
 
@@ -78,7 +80,7 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
         before = states[0] if states else None
         reply = ask(one, tick, x_m, y_m, states)
         states = reply.states
-        if before is not None and before.phase == "acting" and states[0].phase == "acting":
+        if before is not None and before.phase == "acting" and not states[0].blocked_ticks:
             gap = math.hypot(before.x_m - x_m, before.y_m - y_m)
             moved = math.hypot(states[0].x_m - before.x_m, states[0].y_m - before.y_m)
             assert moved == pytest.approx(1.2 * 0.05)
@@ -119,3 +121,29 @@ def test_a_kind_without_behaviour_is_refused_with_the_valid_ones() -> None:
         ask(event("gesturing"), 0, 0.0)
     with pytest.raises(SpecError, match="ids of event pedestrians start with 'e'"):
         event("frontal", id="x1")
+
+
+def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
+    """It runs into a standing robot, stops there, and after a while goes round it and on, never inside its outline."""
+    one = event("frontal")
+    states: tuple[EventState, ...] = ()
+    gaps = []
+    for tick in range(900):
+        reply = ask(one, tick, 35.0, states=states)
+        states = reply.states
+        away = np.abs([states[0].x_m - 35.0, states[0].y_m]) - (0.35, 0.275)
+        gaps.append(float(np.hypot(*np.maximum(away, 0.0))) - 0.3)
+    assert -0.065 < min(gaps) <= 0.01
+    assert sum(gap <= 0.01 for gap in gaps) == pytest.approx(40, abs=8)
+    assert states[0].phase == "over" and states[0].x_m < 33.0
+
+
+def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:
+    """When the robot already stands in the middle, the pedestrian comes near but never touches it."""
+    one = event("obstructing")
+    states: tuple[EventState, ...] = ()
+    for tick in range(200):
+        states = ask(one, tick, 50.0, states=states).states
+        away = np.abs([states[0].x_m - 50.0, states[0].y_m]) - (0.35, 0.275)
+        assert float(np.hypot(*np.maximum(away, 0.0))) - 0.3 > 0.0
+    assert states[0].phase == "acting"

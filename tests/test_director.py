@@ -22,7 +22,7 @@ KEY = keys.director("test", "env")
 def query(tick: int = 0) -> EventQuery:
     return EventQuery(
         episode="t", tick=tick, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
-        robot_w_radps=0.0, route_s_m=0.0, events=(),
+        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
     )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.geometry import Pose, box_disk_gap
-from sumo_nets.giveway import KEEP_M, Body, stepped_round
+from cosim.giveway import KEEP_M, Body, stepped_round
 
 HALF = (0.36, 0.29)
 STEP_M = 1.4 * 0.05

@@ -1,8 +1,8 @@
-"""Nobody walks into the robot: how a shown person steps round it.
+"""Nobody walks into the robot: how a person steps round it.
 
-SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it. The
-shown person goes where SUMO has it, but slides round the robot's outline instead of entering it. Only the person's
-own motion is changed: a robot that drives at somebody still hits them.
+SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; event
+pedestrians know no obstacles at all. A person goes where it wants to go, but slides round the robot's outline instead
+of entering it. Only the person's own motion is changed: a robot that drives at somebody still hits them.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ KEEP_M = 0.12
 """Gap between a person's disk and the robot's outline at which the person begins to step round."""
 
 
+TOUCH_M = 0.01
 FORESEEN_S = 0.6
 """How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
 
@@ -65,6 +66,14 @@ def stepped_round(before: Floats, wanted: Floats, body: Body) -> Floats:
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
     rounded: Floats = moved @ turn.T + body.pose.xy
     return rounded
+
+
+def touches(xy: Floats, body: Body) -> bool:
+    """Whether the disk of a person at (2,) metres meets the robot's outline."""
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    local = (np.asarray(xy) - body.pose.xy)[None] @ np.array([[cos, -sin], [sin, cos]])
+    half = np.array(body.half_m)
+    return bool(_gap(local, -half, half)[0] <= TOUCH_M)
 
 
 def _gap(points: Floats, low: Floats, high: Floats) -> Floats:
