@@ -1,0 +1,167 @@
+"""The command line of places: `cosim map import`, `check`, `list`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+from rich import box
+from rich.console import Console
+from rich.table import Table
+
+from cosim.errors import MapError, UsageError
+
+if TYPE_CHECKING:
+    from cosim.mapcheck import MapCheck
+    from cosim.streetmap import StreetMap
+    from sumo_nets.mapstore import About
+
+map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Cities of the real world: SUMO and OSM.")
+out = Console()
+err = Console(stderr=True)
+
+
+@map_app.command(
+    "import",
+    epilog="Examples:  \n"
+    "`cosim map import berlin.osm.pbf --bbox 13.43,52.46,13.45,52.48`  \n"
+    "`cosim map import hamburg.net.xml.gz --upgrade --name hamburg`",
+)
+def import_(
+    file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
+    name: Annotated[str | None, typer.Option(help="Its name from now on; by default the file's.")] = None,
+    bbox: Annotated[
+        str | None, typer.Option(help="Keep this part: west,south,east,north in degrees (metres without projection).")
+    ] = None,
+    lefthand: Annotated[
+        bool | None, typer.Option("--lefthand/--righthand", help="Side people drive on; by default looked up.")
+    ] = None,
+    upgrade: Annotated[
+        bool, typer.Option("--upgrade", help="Give a net for cars alone sidewalks and crossings.")
+    ] = False,
+) -> None:
+    """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
+    from sumo_nets.importer import Options
+    from sumo_nets.mapstore import checked_map, import_map
+
+    options = Options(bbox=_box("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
+    with err.status(f"importing {file.name} ..."):
+        about = import_map(file, name, options)
+        _, check, about = checked_map(about.name)
+    print_check(check, about)
+    out.print(f"Kept as '{about.name}': see it with `cosim map check {about.name} -o map.png`.", soft_wrap=True)
+    if not check.usable:
+        raise typer.Exit(1)
+
+
+@map_app.command(
+    epilog="Examples:  \n"
+    "`cosim map check hamburg -o hamburg.png`  \n"
+    "`cosim map check hamburg --zoom 900,700,1200,1000 -o junction.png`  \n"
+    "`cosim map check sumo-fkk-in --json`"
+)
+def check(
+    place: Annotated[str, typer.Argument(metavar="MAP", help="A map of `cosim map list`, or a .net.xml(.gz) file.")],
+    picture: Annotated[Path | None, typer.Option("-o", "--output", help="Write a picture of it, a PNG.")] = None,
+    zoom: Annotated[str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
+) -> None:
+    """Say what a map is, what is wrong with it and what it can be used for. Exit code 1: it is not usable."""
+    part = _box("--zoom", zoom)
+    if part is not None and picture is None:
+        raise UsageError("--zoom is for the picture: say where to write it with -o")
+    street_map, found, about = _look_up(place)
+    if picture is not None:
+        from cosim.report.mapsheet import draw_map, write_png
+
+        write_png(draw_map(street_map, found, part), picture)
+    if as_json:
+        report = {"usable": found.usable, "check": found, "about": about}
+        typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
+    else:
+        print_check(found, about)
+        if picture is not None:
+            out.print(f"Picture: {picture}", soft_wrap=True)
+    if not found.usable:
+        raise typer.Exit(1)
+
+
+@map_app.command("list", epilog="Example:  \n`cosim map list`")
+def list_() -> None:
+    """List the maps: imported ones, and those that come with SUMO (imported when first used)."""
+    from sumo_nets.mapstore import known_maps
+
+    table = Table("map", "origin", "file", box=box.SIMPLE_HEAD)
+    for known in known_maps().values():
+        table.add_row(known.name, known.origin, known.source)
+    out.print(table)
+
+
+def print_check(check: MapCheck, about: About | None) -> None:
+    """A check in words."""
+    width_m, height_m = check.size_m
+    table = Table(check.name, "", box=box.SIMPLE_HEAD)
+    for what, value in _rows(check):
+        table.add_row(what, value)
+    table.add_row("size", f"{width_m:.0f} x {height_m:.0f} m, traffic on the {'left' if check.left_hand else 'right'}")
+    out.print(table)
+    said = [("note", note) for note in check.notes]
+    if about is not None:
+        said += [("changed", change) for change in about.changes]
+        said += [("licence", licence) for licence in about.licences or ("none found: ask where the file comes from",)]
+    said += [("NOT USABLE", reason) for reason in check.reasons]
+    for head, words in said:
+        out.print(f"{head}: {words}", soft_wrap=True, markup=False, highlight=False)
+    out.print(f"unit scenarios {_yes(check.unit_possible)}, long-horizon scenarios {_yes(check.long_horizon_possible)}")
+
+
+def _rows(check: MapCheck) -> list[tuple[str, str]]:
+    islands = ", ".join(f"{island.share:.1%}" for island in check.islands[:5])
+    guessed = "unknown" if check.guessed_share is None else f"{check.guessed_share:.0%} of their length"
+    return [
+        ("walkable", f"{check.walkable_km:.2f} km on {check.sidewalks} sidewalks, {check.corners} corners"),
+        ("crossings", f"{check.crossings}, {check.crossing_km:.2f} km; {check.signalised} with signals"),
+        ("roads", f"{check.roads_km:.1f} km of lanes"),
+        ("islands", f"{len(check.islands)}: {islands}{' ...' if len(check.islands) > 5 else ''}"),
+        (
+            "narrower than 1 m",
+            f"{check.narrow} sidewalks, {check.narrow_km:.2f} km; narrowest {check.narrowest_m:.2f} m",
+        ),
+        ("shorter than 1 m", f"{check.stubs} pieces; {check.dead_ends} dead ends"),
+        ("on the road", f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it"),
+        ("guessed sidewalks", guessed),
+    ]
+
+
+def _look_up(place: str) -> tuple[StreetMap, MapCheck, About | None]:
+    from sumo_nets.mapstore import checked_map
+
+    path = Path(place)
+    if not path.is_file():
+        return checked_map(place)
+    if not path.name.endswith((".net.xml", ".net.xml.gz", "net.xml")):
+        raise MapError(f"{path}: only SUMO nets can be checked as they are: import it first with `cosim map import`")
+    from cosim.mapcheck import check_map
+    from sumo_nets.netfacts import read_facts
+    from sumo_nets.netfile import read_net
+
+    street_map = read_net(path)
+    return street_map, check_map(street_map, None, read_facts(path)), None
+
+
+def _box(option: str, words: str | None) -> tuple[float, float, float, float] | None:
+    if words is None:
+        return None
+    try:
+        x0, y0, x1, y1 = (float(word) for word in words.split(","))
+    except ValueError:
+        raise UsageError(f"{option} takes four numbers with commas between them, not '{words}'") from None
+    if not (x0 < x1 and y0 < y1):
+        raise UsageError(f"{option} is west,south,east,north: '{words}' is empty")
+    return x0, y0, x1, y1
+
+
+def _yes(possible: bool) -> str:
+    return "possible" if possible else "NOT possible"

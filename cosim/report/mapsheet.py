@@ -1,0 +1,80 @@
+"""A whole map from above, its islands and problems marked."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+import shapely
+
+from cosim.errors import MapError
+from cosim.mapcheck import MapCheck
+from cosim.report.above import LEGEND_PX, TRACK, Colour, Image, Sheet, draw_streets
+from cosim.streetmap import StreetMap, Strip
+
+MARGIN_M: Final = 20.0
+SIGNAL: Final[Colour] = (30, 150, 60)
+MARKS: Final[dict[str, tuple[Colour, str]]] = {
+    "island": ((200, 60, 200), "cut off from the main island"),
+    "narrow": ((230, 140, 0), "narrower than 1 m"),
+    "on_road": ((220, 0, 0), "mostly on the road"),
+    "never_green": ((120, 0, 0), "signal never green"),
+    "always_green": ((0, 120, 200), "signal always green"),
+    "misfit": ((90, 60, 30), "signal without a program that fits"),
+    "level": ((40, 60, 220), "bridge or tunnel"),
+}
+"""Colour and meaning of each kind of problem."""
+
+
+def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, float, float] | None = None) -> Image:
+    """The picture of a map, or of the `part` x0, y0, x1, y1 (metres) of it, (H, W, 3) uint8 RGB."""
+    x0, y0, x1, y1 = street_map.bounds if part is None else part
+    margin_m = MARGIN_M if part is None else 0.0
+    bounds = (x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
+    sheet, area = Sheet(bounds), shapely.box(*bounds)
+    draw_streets(sheet, street_map, area)
+    for strip in street_map.near("strip", area):
+        if isinstance(strip, Strip) and strip.signalised:
+            middle = strip.line[:, :2].mean(axis=0)
+            sheet.dot(middle[None], SIGNAL, 1.2)
+    for problem in check.problems:
+        colour, _ = MARKS[problem.kind]
+        marked = street_map.strips[problem.strip]
+        sheet.line(marked.line[:, :2], colour, 1.0)
+        sheet.dot(np.array([[problem.x_m, problem.y_m]]), colour, 4.0, filled=False)
+    _legend(sheet.image, check)
+    _scale_bar(sheet, bounds)
+    return sheet.image
+
+
+def write_png(image: Image, path: Path) -> None:
+    """Write an RGB picture. Raises MapError when the folder cannot be written."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
+    except OSError as error:
+        raise MapError(f"{path}: cannot be written: {error.strerror}") from error
+
+
+def _legend(image: Image, check: MapCheck) -> None:
+    """One line below the picture: the figures, then what each colour means."""
+    image[-LEGEND_PX:] = 255
+    kinds = [kind for kind in MARKS if any(problem.kind == kind for problem in check.problems)]
+    crossings = f"{check.crossings} crossings, {check.signalised} with signals"
+    words = f"{check.name}  {check.walkable_km:.1f} km walkable, {crossings}"
+    cells = [(words, TRACK), *((MARKS[kind][1], MARKS[kind][0]) for kind in kinds)]
+    x = 8
+    for text, colour in cells:
+        cv2.putText(image, text, (x, len(image) - 11), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+        x += cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 24
+
+
+def _scale_bar(sheet: Sheet, bounds: tuple[float, float, float, float]) -> None:
+    """A bar of a round number of metres in the lower left corner."""
+    width_m = bounds[2] - bounds[0]
+    bar_m = max(b for b in (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000) if b == 1 or b <= width_m / 5.0)
+    x, y = bounds[0] + 0.02 * width_m, bounds[1] + 0.02 * width_m
+    sheet.line(np.array([[x, y], [x + bar_m, y]]), TRACK, width_m / 400.0)
+    sheet.text((x, y), f"{bar_m} m", TRACK)
