@@ -131,6 +131,7 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
         ),
         ("shorter than 1 m", f"{check.stubs} pieces; {check.dead_ends} dead ends"),
         ("on the road", f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it"),
+        ("over or under a road", f"{check.stacked} sidewalks, with no crossing there"),
         ("guessed sidewalks", guessed),
     ]
 

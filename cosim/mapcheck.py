@@ -73,7 +73,10 @@ class Island(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """Something wrong at one strip. kind: island, narrow, on_road, never_green, always_green, level or misfit."""
+    """Something wrong at one strip.
+
+    kind: island, narrow, on_road, stacked, never_green, always_green, level or misfit.
+    """
 
     kind: str
     strip: str
@@ -85,7 +88,8 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     """What was found. reasons: why the map cannot be used, none when it can; notes: what a user should know.
 
     walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the sidewalks' area that
-    lies on lanes of roads. guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
+    lies on lanes of roads; on_road: sidewalks that do so mostly; stacked: those that cross a road where there is no
+    crossing. guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
     """
 
     name: str
@@ -106,6 +110,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     dead_ends: int
     overlap_share: float
     on_road: int
+    stacked: int
     guessed_share: float | None
     facts: NetFacts | None
     unit_possible: bool
@@ -134,6 +139,7 @@ def check_map(
     share = on_road_shares(street_map, sidewalks)
     areas = np.array([s.polygon.area for s in sidewalks])
     on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY]
+    stacked = [s for s in stacked_on_roads(street_map, sidewalks) if s not in on_road]
     narrow = [s for s in sidewalks if s.width_m < NARROW_M]
     unit = _unit_reasons(street_map, graph, lengths)
     long_horizon = _long_horizon_reasons(street_map, graph, lengths)
@@ -142,6 +148,7 @@ def check_map(
         *_marks("island", [s for s in strips if s.id not in graph.main_strips]),
         *_marks("narrow", narrow),
         *_marks("on_road", on_road),
+        *_marks("stacked", stacked),
     ]
     if facts is not None:
         for kind in ("never_green", "always_green", "levels", "misfits"):
@@ -167,6 +174,7 @@ def check_map(
         dead_ends=sum(corner is None for s in strips for corner in s.corners),
         overlap_share=float((share * areas).sum() / areas.sum()) if areas.sum() > 0.0 else 0.0,
         on_road=len(on_road),
+        stacked=len(stacked),
         guessed_share=guessed_share,
         facts=facts,
         unit_possible=not unit,
@@ -188,6 +196,18 @@ def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
     both = shapely.area(shapely.intersection(polygons[strip], tree.geometries[lane]))
     covered = np.bincount(strip, weights=both, minlength=len(sidewalks))
     return np.minimum(covered / np.maximum(shapely.area(polygons), 1e-9), 1.0)
+
+
+def stacked_on_roads(street_map: StreetMap, sidewalks: Sequence[Strip]) -> list[Strip]:
+    """Sidewalks whose middle line crosses that of a lane of another edge: bridges, tunnels, or maps gone wrong."""
+    roads = [lane for lane in street_map.lanes.values() if _is_road(lane)]
+    if not roads or not sidewalks:
+        return []
+    tree = shapely.STRtree([shapely.LineString(lane.line[:, :2]) for lane in roads])
+    lines = [shapely.LineString(s.line[:, :2]) for s in sidewalks]
+    pairs = zip(*tree.query(lines, predicate="crosses"), strict=True)
+    hit = {int(i) for i, k in pairs if roads[k].edge != sidewalks[i].id}
+    return [sidewalks[i] for i in sorted(hit)]
 
 
 def _is_road(lane: Lane) -> bool:

@@ -42,6 +42,7 @@ OSM_OPTIONS = (
     "--tls.discard-simple",
     "--tls.join",
     "--remove-edges.isolated",
+    "--remove-edges.by-vclass=rail,rail_urban,rail_electric,rail_fast,subway,ship,aircraft",
     "--output.street-names",
     "--output.original-names",
     "--osm.all-attributes",
@@ -111,7 +112,7 @@ def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str])
     net = _crop(file, folder, net, options.bbox, changes)
     changes.append(
         f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed wherever pavements "
-        "meet a road; isolated streets removed, junctions and signals close together joined"
+        "meet a road; railways and isolated streets left out, junctions and signals close together joined"
     )
     root = net_root(net)
     share = _guessed(root, found.tagged)

@@ -178,11 +178,17 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
     lines = polylines([lane["shape"] for lane in lanes])
     widths = np.array([float(lane.get("width", LANE_M)) for lane in lanes])
+    if not np.isfinite(widths).all():
+        raise ValueError("a width that is not a number")
+    # Foreign nets write -1 for SUMO's own width.
+    widths[widths <= 0.0] = LANE_M
     polygons = bands(lines, widths)
     corners = _corners(areas, raw.links)
     ports, signalised = _ports(raw.links, walk, corners, lines)
     met = [(corners.get(ports.get((name, 0), "")), corners.get(ports.get((name, 1), ""))) for name in walk]
-    polygons[: len(walk)] = close_seams(polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # Slivers in foreign nets have mitres at infinity, which GEOS cuts off by itself.
+        polygons[: len(walk)] = close_seams(polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))

@@ -47,7 +47,10 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     centres = shapely.linestrings(np.concatenate(lines), indices=owner)
     around = shapely.buffer(centres, np.maximum(widths, SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
-    return [band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around]
+    polygons = [band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around]
+    if any(polygon is None or polygon.is_empty for polygon in polygons):
+        raise ValueError("a shape whose band has no area")
+    return polygons
 
 
 def areas_of(shape: shapely.Geometry, *, largest: bool) -> Any:

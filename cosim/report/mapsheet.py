@@ -20,6 +20,7 @@ MARKS: Final[dict[str, tuple[Colour, str]]] = {
     "island": ((200, 60, 200), "cut off from the main island"),
     "narrow": ((230, 140, 0), "narrower than 1 m"),
     "on_road": ((220, 0, 0), "mostly on the road"),
+    "stacked": ((250, 90, 60), "over or under a road"),
     "never_green": ((120, 0, 0), "signal never green"),
     "always_green": ((0, 120, 200), "signal always green"),
     "misfit": ((90, 60, 30), "signal without a program that fits"),
