@@ -278,6 +278,7 @@ def print_table(table: pd.DataFrame, scheduled: int) -> None:
 
 def print_episode(record: object) -> None:
     """One episode in words: how it ended, every failure, every event, every metric."""
+    from cosim.clock import Clock
     from cosim.metrics import METRICS
     from cosim.record import Record
 
@@ -286,7 +287,7 @@ def print_episode(record: object) -> None:
     for failure in record.failures:
         what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
         fault = f", {failure.fault}" if failure.fault else ""
-        out.print(f"  {failure.tick * 0.05:7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
+        out.print(f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
     for event in record.events:
         at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
         out.print(f"  event {event.id} {event.kind}: {at}")

@@ -48,25 +48,24 @@ def command_of(answer: object, *, waypoint_dt_s: float, limits: Limits, who: str
     if isinstance(answer, Command):
         v_mps, w_radps = answer.v_mps, answer.w_radps
         if not (_is_number(v_mps) and _is_number(w_radps)):
-            raise PolicyError(f"policy '{who}' answered {answer!r}: both speeds must be finite numbers")
+            kinds = f"{type(v_mps).__name__}, {type(w_radps).__name__}"
+            raise PolicyError(f"policy '{who}' answered a Command of {kinds}: both speeds must be finite numbers")
         return clipped(Command(float(v_mps), float(w_radps)), limits)
     try:
         waypoints = np.asarray(answer, dtype=float)
     except (TypeError, ValueError) as error:
-        raise PolicyError(f"policy '{who}' answered {_brief(answer)}: neither a Command nor waypoints") from error
+        raise PolicyError(
+            f"policy '{who}' answered a {type(answer).__name__}: neither a Command nor waypoints"
+        ) from error
     if waypoints.ndim != 2 or waypoints.shape[0] < 1 or waypoints.shape[1] != 2:
         raise PolicyError(
             f"policy '{who}' answered an array of shape {waypoints.shape}: waypoints have shape (N, 2), N >= 1"
         )
     if not np.isfinite(waypoints).all():
-        raise PolicyError(f"policy '{who}' answered waypoints with NaN or infinity: {_brief(waypoints.tolist())}")
+        first = waypoints[~np.isfinite(waypoints).all(axis=1)][0].tolist()
+        raise PolicyError(f"policy '{who}' answered waypoints with NaN or infinity: {first}")
     return clipped(command_from_waypoint(float(waypoints[0, 0]), float(waypoints[0, 1]), waypoint_dt_s), limits)
 
 
 def _is_number(value: object) -> bool:
     return isinstance(value, int | float | np.floating | np.integer) and math.isfinite(value)
-
-
-def _brief(value: object) -> str:
-    text = repr(value)
-    return text if len(text) <= 120 else text[:117] + "..."

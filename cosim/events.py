@@ -45,12 +45,12 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an event stands. phase: waiting (before its trigger), acting, or over. since_tick: in this phase.
+    """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good. since_tick: in this phase.
 
     aim_rad: the heading an actor has committed to, if it has. blocked_ticks: how long it has stood against the robot.
     """
 
-    phase: Literal["waiting", "acting", "over"]
+    phase: Literal["waiting", "acting", "over", "gone"]
     since_tick: int
     x_m: float
     y_m: float

@@ -124,10 +124,13 @@ def stalled_time_s(episode: Episode) -> float:
 
 
 def failure_to_progress(episode: Episode) -> float:
-    """Number of successive 5 s windows with less than 0.1 m of progress along the route."""
+    """Number of successive 5 s windows in which driving gained less than 0.1 m of arc length; jumps do not count."""
     window = round(PROGRESS_WINDOW_S / episode.log.tick_s)
-    s_m = episode.log.route_s_m
-    return float(sum(s_m[i + window] - s_m[i] < PROGRESS_MIN_M for i in range(0, len(s_m) - window, window)))
+    s_m, reset_s_m = episode.log.route_s_m, episode.log.reset_s_m
+    begins = np.concatenate([[0.0], np.where(np.isnan(reset_s_m), s_m, reset_s_m)[:-1]])
+    driven = s_m - begins
+    windows = range(0, len(driven) - window + 1, window)
+    return float(sum(driven[i : i + window].sum() < PROGRESS_MIN_M for i in windows))
 
 
 def count(kind: str) -> Callable[[Episode], float]:

@@ -3,14 +3,16 @@
 Rules (the paper leaves them open; each is a decision of this benchmark):
 
 - collision: the body touches anything but the ground, or its footprint overlaps a person's 0.3 m disk or a
-  vehicle's box, at any physics substep. One event per thing until they have been apart for 1 s
-  (people and vehicles: more than 0.1 m apart).
+  vehicle's box, at any physics substep. One event per thing until they have been apart for 1 s (people and
+  vehicles: more than 0.1 m apart; walls and objects: without contact).
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
 - freezing: for 10 s the robot was never 0.5 m away from where it was at their beginning; time of waiting before a
   red crossing of the route does not count.
+- Signals are judged on the crossings of the reference route, by arc length.
 - One failure a tick: collision before out_of_lane before freezing.
-- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing),
-  heading along it; after 3 failures within 10 m of the route, at the first free one beyond them.
+- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing nor
+  at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at least 1 m
+  beyond them.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -24,7 +26,7 @@ from typing import Literal
 import numpy as np
 
 from cosim.clock import Clock
-from cosim.geometry import Floats, Pose, box_disk_gap
+from cosim.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.scenario import Scenario
 from cosim.state import PERSON_RADIUS_M, Contact, Signal
 from cosim.step import Reset, Step
@@ -39,9 +41,12 @@ FREE_OF_PEOPLE_M = 1.0
 FREE_OF_VEHICLES_M = 4.0
 SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
+BEYOND_M = 1.0
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
 STANDING_MPS = 0.05
+LEFT_M = 0.3
+"""A robot this far before a crossing has left it and may enter it anew."""
 
 FailureKind = Literal["collision", "out_of_lane", "freezing"]
 Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
@@ -101,6 +106,7 @@ class Referee:
             return Verdict(failure, None, "timeout", red, waits)
         reset = self._reset(failure, step)
         self._window.clear()
+        self._entered.clear()
         return Verdict(failure, reset, None, red, waits)
 
     def _end(self, step: Step) -> Literal["goal", "timeout"] | None:
@@ -127,9 +133,9 @@ class Referee:
         """A thing may collide anew once it has been away for a second."""
         if not self._touching:
             return
-        gaps = person_gaps(step, self._half_m)
+        gaps, beside = person_gaps(step, self._half_m), vehicles_within(step, self._half_m, APART_M)
         for other, last_tick in list(self._touching.items()):
-            if gaps.get(other, np.inf) <= APART_M:
+            if gaps.get(other, np.inf) <= APART_M or other in beside:
                 self._touching[other] = step.tick
             elif (step.tick - last_tick) * self._clock.tick_s > APART_S:
                 del self._touching[other]
@@ -142,7 +148,6 @@ class Referee:
 
     def _freezing(self, step: Step, waits_at_red: bool) -> Failure | None:
         if waits_at_red:
-            self._window.clear()
             return None
         self._window.append(step.motion.robot.pose[:2])
         if len(self._window) < (self._window.maxlen or 0):
@@ -166,7 +171,7 @@ class Referee:
                 self._entered.add(crossing.id)
                 if signal_is_red(crossing.id, step.street.signals):
                     return crossing.id
-            elif not inside and step.route_s_after_m < crossing.enter_s_m - 1.0:
+            elif step.route_s_after_m < crossing.enter_s_m - LEFT_M:
                 self._entered.discard(crossing.id)
         return None
 
@@ -182,10 +187,12 @@ class Referee:
         recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
         stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
-        waypoints = np.minimum(np.arange(count) * WAYPOINT_STEP_M, self._route.length_m)
+        last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
+        waypoints = np.arange(count) * WAYPOINT_STEP_M
+        waypoints = waypoints[waypoints <= last_m]
         if stuck:
             self._failed_at_s.clear()
-            order = waypoints[waypoints > max(recent)]
+            order = waypoints[waypoints > max(recent) + BEYOND_M]
         else:
             order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
         for s_m in order:
@@ -217,6 +224,16 @@ def person_gaps(step: Step, half_m: tuple[float, float]) -> dict[str, float]:
         return {}
     gaps: Floats = box_disk_gap(np.array([pose]), *half_m, people.xy[None])[0] - PERSON_RADIUS_M
     return dict(zip(people.ids, gaps.tolist(), strict=True))
+
+
+def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> set[str]:
+    """Ids of the vehicles whose box comes within a gap of the robot's outline at the end of a Step."""
+    vehicles, pose = step.street_after.vehicles, step.motion.robot.pose
+    if not len(vehicles):
+        return set()
+    boxes = np.column_stack([vehicles.xy, vehicles.heading])
+    near = boxes_overlap(np.array(pose), np.array(half_m) + gap_m, boxes, vehicles.size / 2)
+    return {vehicles.ids[i] for i in np.flatnonzero(near)}
 
 
 def fault_of(person: str, robot_speed_mps: float, step: Step) -> Fault:

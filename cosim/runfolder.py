@@ -27,7 +27,10 @@ import pandas as pd
 from cosim.errors import RunError, unknown
 from cosim.record import Record
 from cosim.results import row_of, table_of
-from cosim.scenario import Scenario, Suite, read_suite, write_suite
+from cosim.scenario import Suite, write_suite
+
+UNFINISHED = {"episodes", "logs", "scenarios.json", "run.json.part"}
+"""All that a run leaves that was killed before it began."""
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,7 +60,7 @@ class RunFolder:
         """A new run folder. Raises RunError when one is there already or the place cannot be written."""
         if (path / "run.json").exists():
             raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
-        if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
             raise RunError(f"{path} exists and is no run folder. Choose another --out.")
         try:
             for folder in (path, path / "episodes", path / "logs"):
@@ -100,17 +103,14 @@ class RunFolder:
         os.pwrite(self._lock, str(os.getpid()).encode(), 0)
         with closing(self._database()) as database, database:
             database.execute("create table if not exists episodes (scenario text primary key, row text, record text)")
-        self._adopt()
+        for scenario_id in sorted(set(self.spec.scenarios) - self.finished()):
+            self.adopt(scenario_id)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         os.close(self._lock)
-
-    def scenarios(self) -> tuple[Scenario, ...]:
-        """The resolved specs."""
-        return read_suite(self.path / "scenarios.json").scenarios
 
     def episode_folder(self, scenario_id: str) -> Path:
         return self.path / "episodes" / scenario_id
@@ -134,17 +134,19 @@ class RunFolder:
         """Write results.csv and return its table."""
         table = table_of(read_records(self.path))
         temporary = self.path / "results.csv.part"
-        table.to_csv(temporary, index=False)
-        temporary.replace(self.path / "results.csv")
+        try:
+            table.to_csv(temporary, index=False)
+            temporary.replace(self.path / "results.csv")
+        except OSError as error:
+            raise RunError(f"{self.path / 'results.csv'}: {error.strerror}. All episodes are kept.") from error
         return table
 
-    def _adopt(self) -> None:
-        """Take in episodes that a worker finished but whose row was not written before a kill."""
-        finished = self.finished()
-        for scenario_id in self.spec.scenarios:
-            path = self.episode_folder(scenario_id) / "record.json"
-            if scenario_id not in finished and path.exists():
-                self.add(Record.load(path))
+    def adopt(self, scenario_id: str) -> bool:
+        """Take in the record that a worker wrote for a scenario; False when there is none."""
+        path = self.episode_folder(scenario_id) / "record.json"
+        if path.exists():
+            self.add(Record.load(path))
+        return path.exists()
 
     def _database(self) -> sqlite3.Connection:
         return _connect(self.path)

@@ -25,7 +25,7 @@ SHOWN_BEHIND_M = 30.0
 """An event's pedestrians exist while the robot is within these arc lengths of its place."""
 
 LEAVES_M = 15.0
-"""One whose event is over is gone when the robot is this far away: behind it, out of its sight."""
+"""One whose event is over is gone for good when the robot is this far away: behind it, out of its sight."""
 
 COMMIT_M = 5.0
 """`frontal` aims at the robot's current position until this close, then keeps its line as people do."""
@@ -81,6 +81,9 @@ def _advance(event: Event, state: EventState, query: EventQuery) -> EventState:
         state = msgspec.structs.replace(
             state, phase="acting", since_tick=query.tick, triggered_tick=query.tick, trigger_distance_m=ahead_m
         )
+    far_m = math.hypot(state.x_m - query.robot_x_m, state.y_m - query.robot_y_m)
+    if state.phase == "gone" or (state.phase == "over" and far_m > LEAVES_M):
+        return state if state.phase == "gone" else msgspec.structs.replace(state, phase="gone", since_tick=query.tick)
     return behavior.act(event, state, query)
 
 
@@ -99,8 +102,7 @@ def _shown(event: Event, before: EventState, after: EventState, query: EventQuer
 def _present(event: Event, state: EventState, query: EventQuery) -> bool:
     if not -SHOWN_BEHIND_M <= event.route_s_m - query.route_s_m <= SHOWN_AHEAD_M:
         return False
-    far_m = math.hypot(state.x_m - query.robot_x_m, state.y_m - query.robot_y_m)
-    return state.phase != "over" or far_m <= LEAVES_M
+    return state.phase != "gone"
 
 
 def _aside(event: Event, lateral_m: float, heading_rad: float) -> EventState:

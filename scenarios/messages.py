@@ -34,7 +34,14 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     status: Literal["done", "crashed"]
 
 
-Message = Progress | Done
+class Unsaved(msgspec.Struct, frozen=True, tag=True):
+    """The episode is over, but its record could not be written."""
+
+    scenario: str
+    reason: str
+
+
+Message = Progress | Done | Unsaved
 
 encode = msgspec.msgpack.Encoder().encode
 decode_job = msgspec.msgpack.Decoder(Job).decode

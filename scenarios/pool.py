@@ -7,6 +7,7 @@ no sign of life is killed. After the last attempt the episode is recorded as cra
 from __future__ import annotations
 
 import multiprocessing
+import os
 import signal
 import time
 from collections import deque
@@ -16,20 +17,20 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
+from cosim.errors import RunError
 from cosim.ports import Manifest
 from cosim.record import Record
 from cosim.runfolder import RunFolder
 from cosim.scenario import Scenario, content_hash
 from cosim.versions import versions
 from scenarios import worker
-from scenarios.messages import Done, Job, Message, decode_message, encode
+from scenarios.messages import Done, Job, Message, Unsaved, decode_message, encode
 
 ATTEMPTS = 2
 SILENCE_S = 300.0
 """A worker that says nothing for so long hangs; a slow policy says something once a simulated second."""
 
 POLL_S = 1.0
-LOG_TAIL = 400
 
 Tell = Callable[[Message], None]
 
@@ -68,7 +69,7 @@ def run_all(
                 if attempts[scenario.id] < ATTEMPTS:
                     waiting.appendleft(scenario)
                 else:
-                    pool.give_up(scenario, f"{why}, {ATTEMPTS} times")
+                    pool.give_up(scenario, f"{why}, {ATTEMPTS} times; see logs/ in the run folder")
     finally:
         pool.close()
 
@@ -91,6 +92,7 @@ class _Pool:
         idle = next((w for w in self._workers if w.job is None), None) or self._start()
         idle.job, idle.heard_at = scenario, time.monotonic()
         target = str(self._folder.episode_folder(scenario.id))
+        (Path(target) / "record.json").unlink(missing_ok=True)
         try:
             idle.pipe.send_bytes(encode(Job(scenario, self._folder.spec.suite_hash, target, self._frames_every_s)))
         except BrokenPipeError:
@@ -104,8 +106,12 @@ class _Pool:
             if self._hear(one):
                 continue
             why = self._death(one)
-            if why is not None and one.job is not None:
-                self._workers.remove(one)
+            self._workers.remove(one)
+            if one.job is None:
+                continue
+            if self._folder.adopt(one.job.id):
+                self._tell(Done(one.job.id, "done"))
+            else:
                 lost.append((one.job, why))
         return lost
 
@@ -115,8 +121,10 @@ class _Pool:
             while one.pipe.poll():
                 message = decode_message(one.pipe.recv_bytes())
                 one.heard_at = time.monotonic()
+                if isinstance(message, Unsaved):
+                    raise RunError(f"{message.reason}. Finished episodes are kept; make room and go on with --resume.")
                 if isinstance(message, Done):
-                    self._folder.add(Record.load(self._folder.episode_folder(message.scenario) / "record.json"))
+                    self._folder.adopt(message.scenario)
                     one.job = None
                 self._tell(message)
         except (EOFError, ConnectionResetError):
@@ -124,16 +132,17 @@ class _Pool:
             return False
         return one.job is None or time.monotonic() - one.heard_at < SILENCE_S
 
-    def _death(self, one: _Worker) -> str | None:
+    def _death(self, one: _Worker) -> str:
         """How a worker ended; a hanging one is killed."""
+        one.pipe.close()
         if one.process.is_alive():
             one.process.kill()
             one.process.join()
-            return f"no sign of life for {SILENCE_S:g} s"
-        one.pipe.close()
+            return "the environment process showed no sign of life"
         code = one.process.exitcode or 0
-        how = f"killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-        return f"the environment process was {how}{_last_words(one.log)}"
+        if code < 0:
+            return f"the environment process was killed by {signal.Signals(-code).name}"
+        return f"the environment process ended with exit code {code}"
 
     def give_up(self, scenario: Scenario, reason: str) -> None:
         """Record a scenario that no worker survives as crashed."""
@@ -152,8 +161,11 @@ class _Pool:
             reason=reason,
         )
         target = self._folder.episode_folder(scenario.id)
-        target.mkdir(parents=True, exist_ok=True)
-        record.save(target / "record.json")
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            record.save(target / "record.json")
+        except OSError as error:
+            raise RunError(f"{target}: {error.strerror}. Finished episodes are kept; go on with --resume.") from error
         self._folder.add(record)
         self._tell(Done(scenario.id, "crashed"))
 
@@ -175,7 +187,10 @@ class _Pool:
         mine, theirs = context.Pipe()
         log = self._folder.path / "logs" / f"worker-{self._started}.log"
         process = context.Process(
-            target=worker.main, args=(theirs, self._policy, str(log)), name=f"cosim-env-{self._started}", daemon=True
+            target=worker.main,
+            args=(theirs, self._policy, str(log), os.getpid()),
+            name=f"cosim-env-{self._started}",
+            daemon=True,
         )
         process.start()
         theirs.close()
@@ -183,11 +198,3 @@ class _Pool:
         one = _Worker(process, mine, log)
         self._workers.append(one)
         return one
-
-
-def _last_words(log: Path) -> str:
-    """The end of a worker's log, to be put behind a reason."""
-    if not log.exists():
-        return ""
-    said = log.read_text(errors="replace").strip()[-LOG_TAIL:].strip()
-    return f"; it last printed: {said}" if said else ""

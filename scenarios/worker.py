@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import cv2
 
+from cosim.clock import Clock
 from cosim.policies.load import load_policy
 from cosim.referee import Verdict
 from cosim.step import Step
-from scenarios.messages import Done, Job, Progress, decode_job, encode
+from scenarios.messages import Done, Job, Message, Progress, Unsaved, decode_job, encode
 
 if TYPE_CHECKING:
     from scenarios.run import Watch
@@ -28,9 +29,12 @@ REPORT_EVERY_TICKS = 20
 PR_SET_PDEATHSIG = 1
 
 
-def main(pipe: Connection, policy: str, log_path: str) -> None:
-    """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew."""
-    die_with_parent()
+def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
+    """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew.
+
+    parent: process id of the run that started this one; without it there is nobody to work for.
+    """
+    die_with(parent)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with Path(log_path).open("ab", buffering=0) as log:
         os.dup2(log.fileno(), 1)
@@ -48,11 +52,15 @@ def main(pipe: Connection, policy: str, log_path: str) -> None:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
             driver = load_policy(policy)
         folder = Path(job.folder)
-        folder.mkdir(parents=True, exist_ok=True)
-        if outcome.log is not None:
-            outcome.log.save(folder / "trajectory.npz")
-        outcome.record.save(folder / "record.json")
-        pipe.send_bytes(encode(Done(job.scenario.id, outcome.record.status)))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            if outcome.log is not None:
+                outcome.log.save(folder / "trajectory.npz")
+            outcome.record.save(folder / "record.json")
+        except OSError as error:
+            send(pipe, Unsaved(job.scenario.id, f"{folder}: {error.strerror}"))
+            continue
+        send(pipe, Done(job.scenario.id, outcome.record.status))
 
 
 def watcher(job: Job, pipe: Connection) -> Watch:
@@ -67,20 +75,27 @@ def watcher(job: Job, pipe: Connection) -> Watch:
     def watch(step: Step, verdict: Verdict) -> None:
         nonlocal failures, next_frame_s
         failures += verdict.failure is not None
-        time_s = step.tick * 0.05
+        time_s = Clock().time_s(step.tick)
         if step.frame is not None and job.frames_every_s and time_s >= next_frame_s:
             next_frame_s += job.frames_every_s
             cv2.imwrite(str(frames / f"{step.tick:06d}.png"), step.frame.rgb[..., ::-1])
         if step.tick % REPORT_EVERY_TICKS == 0:
-            pipe.send_bytes(encode(Progress(job.scenario.id, time_s, step.route_s_after_m, failures)))
+            send(pipe, Progress(job.scenario.id, time_s, step.route_s_after_m, failures))
 
     return watch
 
 
-def die_with_parent() -> None:
-    """Ask Linux to kill this process when its parent dies, however that happens."""
+def send(pipe: Connection, message: Message) -> None:
+    """Say something to the run. When it is gone this process ends at once: that is no crash of the episode."""
+    try:
+        pipe.send_bytes(encode(message))
+    except OSError:
+        os._exit(1)
+
+
+def die_with(parent: int) -> None:
+    """Ask Linux to kill this process when its parent dies, however that happens; end if it is dead already."""
     if sys.platform == "linux":
-        parent = os.getppid()
         ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:
-            os._exit(1)
+    if os.getppid() != parent:
+        os._exit(1)

@@ -135,7 +135,7 @@ def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:
         gaps.append(float(np.hypot(*np.maximum(away, 0.0))) - 0.3)
     assert -0.065 < min(gaps) <= 0.01
     assert sum(gap <= 0.01 for gap in gaps) == pytest.approx(40, abs=8)
-    assert states[0].phase == "over" and states[0].x_m < 33.0
+    assert states[0].phase == "gone" and states[0].x_m < 33.0
 
 
 def test_an_obstructing_pedestrian_does_not_step_into_the_robot() -> None:

@@ -46,6 +46,28 @@ class Slow(Base):
     manifest = Manifest("slow", rate_hz=20.0, camera=None)
     def act(self, observation):
         import time; time.sleep(0.01); return Command(1.0, 0.0)
+class DiesLate(Base):
+    # takes its process down right after the record of t-1 is on the disk
+    def act(self, observation):
+        from cosim.record import Record
+        save = Record.save
+        def dying(record, path):
+            save(record, path)
+            if record.scenario == "t-1": os.kill(os.getpid(), signal.SIGKILL)
+        if self.count == 0: Record.save = dying
+        self.count += 1
+        return Command(1.0, 0.0)
+class DiskFull(Base):
+    # the disk is full when the trajectory of t-1 is written
+    def act(self, observation):
+        from cosim.record import Log
+        save = Log.save
+        def failing(log, path):
+            if "t-1" in str(path): raise OSError(28, "No space left on device")
+            save(log, path)
+        if self.count == 0: Log.save = failing
+        self.count += 1
+        return Command(1.0, 0.0)
 class Unfinished: pass
 """
 
@@ -135,7 +157,6 @@ def test_an_interrupted_run_is_finished_by_resume(desk: Path, whole_run: Path, h
     command = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "straight", "--out", out.name]
     run = subprocess.Popen(command, cwd=desk, stderr=subprocess.PIPE, text=True, env=environment())
     wait_for(lambda: (out / "episodes/t-0/record.json").exists())
-    wait_for(lambda: (out / "episodes").exists() and not (out / "episodes/t-1/record.json").exists())
     run.send_signal(how)
     said = run.communicate(timeout=30)[1]
     if how == signal.SIGINT:
@@ -147,6 +168,49 @@ def test_an_interrupted_run_is_finished_by_resume(desk: Path, whole_run: Path, h
     assert again.returncode == 0, again.stderr
     assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == kept
     assert (out / "results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+@pytest.mark.parametrize("delay_s", [0.0, 0.05, 0.3])
+def test_a_run_killed_at_its_start_leaves_no_false_crash(desk: Path, whole_run: Path, delay_s: float) -> None:
+    """A kill while the first environment process comes up loses nothing, and resuming gives the same table."""
+    out = desk / f"early-{delay_s:g}"
+    command = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "straight", "--out", out.name]
+    run = subprocess.Popen(command, cwd=desk, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=environment())
+    wait_for(lambda: children(run.pid))
+    left = children(run.pid)
+    time.sleep(delay_s)
+    run.kill()
+    run.wait()
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in left))
+    assert not list(out.glob("episodes/*/record.json"))
+    again = cosim("run", "tiny.json", "--policy", "straight", "--out", out.name, "--resume", cwd=desk)
+    assert again.returncode == 0, again.stderr
+    assert (out / "results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+def children(pid: int) -> list[int]:
+    """Environment processes of a run."""
+    task = Path(f"/proc/{pid}/task/{pid}/children")
+    pids = [int(word) for word in task.read_text().split()] if task.exists() else []
+    lines = {p: Path(f"/proc/{p}/cmdline") for p in pids}
+    return [p for p, line in lines.items() if line.exists() and b"spawn_main" in line.read_bytes()]
+
+
+def test_an_episode_finished_before_its_process_died_is_kept(desk: Path) -> None:
+    """A process that dies after writing its record has finished the episode: it is neither run again nor crashed."""
+    out = desk / "late"
+    run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--out", out.name, cwd=desk)
+    assert run.returncode == 0, run.stdout
+    assert list(rows(out)["status"]) == ["done", "done", "done"]
+
+
+def test_a_full_disk_ends_the_run_with_the_reason(desk: Path) -> None:
+    """When a record cannot be written the run stops, says why, and keeps what is finished."""
+    out = desk / "full"
+    run = cosim("run", "tiny.json", "--policy", "mine:DiskFull", "--out", out.name, cwd=desk)
+    assert run.returncode == 1 and "No space left on device" in run.stderr and "--resume" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"
 
 
 def alive(out: Path) -> bool:

@@ -95,7 +95,7 @@ def test_a_rate_without_distance_is_absent_not_zero() -> None:
     assert measures["failures_per_100m"] is None
     assert measures["time_to_goal_s"] is None
     assert measures["stalled_time_s"] == pytest.approx(20.0)
-    assert measures["failure_to_progress"] == 3.0
+    assert measures["failure_to_progress"] == 4.0
 
 
 def test_space_metrics_have_the_signs_of_their_names() -> None:
@@ -119,3 +119,11 @@ def test_every_metric_is_defined_for_every_episode() -> None:
         values = measure(one)
         assert set(values) == set(METRICS)
         assert all(value is None or np.isfinite(value) for value in values.values())
+
+
+def test_resets_neither_hide_nor_invent_a_failure_to_progress() -> None:
+    """A jump forward does not make a standing robot progress, and a jump back does not make a driving one stall."""
+    stands = log([0.0] * 200 + [10.0] * 200, resets={199: 10.0})
+    assert measure(episode(stands))["failure_to_progress"] == 4.0
+    drives = [0.05 * (i + 1) for i in range(150)] + [0.05 * (i + 1) for i in range(150)]
+    assert measure(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0

@@ -14,7 +14,7 @@ from cosim.events import EventReply
 from cosim.geometry import Pose
 from cosim.referee import Referee, Verdict
 from cosim.scenario import City, RouteCrossing, Scenario
-from cosim.state import STILL, Contact, Motion, People, RobotState, Signal, Street, frozen
+from cosim.state import NO_VEHICLES, STILL, Contact, Motion, People, RobotState, Signal, Street, Vehicles, frozen
 from cosim.step import Step
 from cosim.streetmap import WalkableArea
 
@@ -50,10 +50,11 @@ def step(
     who: People | None = None,
     speed: float = 1.0,
     red: Sequence[str] = (),
+    cars: Vehicles = NO_VEHICLES,
 ) -> Step:
     """The robot ends the tick at (x, y), which is also its place on the route."""
     robot = RobotState(Pose(x_m, y_m, 0.0), speed)
-    street = Street(tick, who or people(), signals={name: Signal(False) for name in red})
+    street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
     motion = Motion(robot, frozen([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
     return Step(tick, robot, street, x_m, None, STILL, NOTHING, motion, street, x_m)
 
@@ -158,15 +159,58 @@ def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
 
 
 def test_three_failures_in_one_place_carry_the_robot_beyond_it() -> None:
-    """The third failure within 10 m of the route puts the robot at the first waypoint behind all of them."""
+    """The third failure within 10 m of the route puts the robot at the first waypoint at least 1 m behind them all."""
     one = referee()
     resets = [one.judge(step(t, x, 3.0)).reset for t, x in enumerate((21.0, 24.0, 22.0, 25.0))]
-    assert [r.route_s_m for r in resets if r is not None] == [20.0, 25.0, 25.0, 25.0]
+    assert [r.route_s_m for r in resets if r is not None] == [20.0, 25.0, 30.0, 25.0]
     stuck = referee()
-    at = [stuck.judge(step(t, 24.0, 3.0)).reset for t in range(3)]
-    assert [r.route_s_m for r in at if r is not None] == [25.0, 25.0, 25.0]
+    at = [stuck.judge(step(t, 24.9999, 3.0)).reset for t in range(4)]
+    assert [r.route_s_m for r in at if r is not None] == [25.0, 25.0, 30.0, 25.0]
     far = [referee().judge(step(t, 20.0 * t, 3.0)).reset for t in range(3)]
     assert [r.route_s_m for r in far if r is not None] == [0.0, 20.0, 40.0]
+
+
+def test_a_robot_that_never_moves_is_carried_along_the_route_but_never_to_its_goal() -> None:
+    """Frozen at every place, it is put on and on, and the episode ends by time, not at the goal."""
+    one = referee(time_limit_s=1500.0)
+    x_m, ended, tick = 0.0, None, 0
+    while ended is None:
+        verdict = one.judge(step(tick, x_m, speed=0.0))
+        x_m = verdict.reset.route_s_m if verdict.reset else x_m
+        ended, tick = verdict.ended, tick + 1
+    assert ended == "timeout" and 90.0 <= x_m <= 98.0
+
+
+def test_a_vehicle_collides_anew_only_after_it_has_been_away() -> None:
+    """A car that stays within 0.1 m has not parted; one that drove off and comes back has."""
+    one = referee()
+    near = Vehicles.of(("v0",), [[20.0, 1.9]], [0.0], [0.0], [[4.5, 1.8]])
+    hit = [Contact("vehicle", "v0", 0)]
+    assert one.judge(step(0, 20.0, contacts=hit)).failure is not None
+    for tick in range(1, 60):
+        one.judge(step(tick, 20.0 + 0.001 * tick, 0.65, cars=near))
+    assert one.judge(step(60, 20.0, contacts=hit)).failure is None
+    for tick in range(61, 90):
+        one.judge(step(tick, 20.0 + 0.03 * tick))
+    assert one.judge(step(90, 25.0, contacts=hit)).failure is not None
+
+
+def test_a_crossing_can_be_entered_at_red_after_it_was_left() -> None:
+    """Entered at green, left backwards by half a metre, and entered again at red: that is an entry at red."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    at = [(30.2, False), (29.9, False), (29.5, False), (29.6, True), (30.1, True)]
+    verdicts = [one.judge(step(t, x, red=[":x_c0"] if red else [])) for t, (x, red) in enumerate(at)]
+    assert [v.red_light_entry for v in verdicts] == [None, None, None, None, ":x_c0"]
+
+
+def test_time_before_and_after_a_red_signal_adds_up_to_freezing() -> None:
+    """Waiting at red pauses the count of a freezing, it does not begin it anew."""
+    crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
+    one = referee(crossings=(crossing,))
+    reds = [120 <= t < 400 for t in range(500)]
+    verdicts = [one.judge(step(t, 29.0, red=[":x_c0"] if red else [])) for t, red in enumerate(reds)]
+    assert [t for t, v in enumerate(verdicts) if v.failure is not None] == [480]
 
 
 def test_the_episode_ends_at_the_goal_or_at_its_time() -> None:

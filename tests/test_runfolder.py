@@ -50,10 +50,12 @@ def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: 
 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
-    """A second run into the same folder is refused, and so is one into a folder of other things."""
+    """A second run into a folder is refused, and so is a folder of other things; a run killed at once begins anew."""
     RunFolder.create(tmp_path / "run", SPEC, SUITE)
     with pytest.raises(RunError, match=r"already holds a run\. Add --resume"):
         RunFolder.create(tmp_path / "run", SPEC, SUITE)
+    (tmp_path / "begun/episodes").mkdir(parents=True)
+    RunFolder.create(tmp_path / "begun", SPEC, SUITE)
     (tmp_path / "other").mkdir()
     (tmp_path / "other/photo.png").touch()
     with pytest.raises(RunError, match="is no run folder"):

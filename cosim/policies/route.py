@@ -102,7 +102,7 @@ def crossing_limit(known: Privileged) -> float:
         before_m = enter_s_m - known.route_s_m
         if not 0.0 < before_m < 8.0:
             continue
-        needs_s = (before_m + leave_s_m - enter_s_m + HALF_LENGTH_M) / 1.1 + 0.5
+        needs_s = (before_m + leave_s_m - enter_s_m + HALF_LENGTH_M) / 1.3 + 0.5
         signal = known.signals.get(crossing_id)
         if signal is not None:
             may_enter = signal.walk and (signal.changes_in_s is None or signal.changes_in_s > needs_s)
