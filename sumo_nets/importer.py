@@ -321,7 +321,7 @@ def _retold(file: MapFile, words: str) -> str:
     shown = str(file.source) if readable else file.source.with_suffix("").name
     words = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", words)
     words = words.replace(str(file.path), shown).replace(f"{file.path.parent}/", "")
-    if "without any edge" in words:
+    if "without any edge" in words or "No nodes loaded" in words:
         words += "\nNo street of the file survived the conversion: import a larger area, with whole streets in it."
     if "netconvert" in words and not readable:
         words += f"\n(netconvert cannot read {file.packing}: unpack {file.source.name} first to repeat this)"

@@ -25,6 +25,8 @@ LARGEST_BYTES = 2 * 1024**3
 PIECE_BYTES = 1 << 20
 READABLE = "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can be read"
 ON_FOOT = frozenset(("footway", "path", "pedestrian", "steps", "living_street", "track", "cycleway", "bridleway"))
+FAST = frozenset(("motorway", "motorway_link", "trunk", "trunk_link"))
+NO_STREET = frozenset(("construction", "proposed", "raceway", "bus_guideway", "platform", "rest_area", "services"))
 
 Format = Literal["net", "osm"]
 
@@ -163,6 +165,7 @@ class _Scan:
     lonlat: list[tuple[float, float]] = field(default_factory=list)
     ways: int = 0
     roads: int = 0
+    fast: int = 0
     on_foot: int = 0
     tagged: set[str] = field(default_factory=set)
     head: dict[str, str] = field(default_factory=dict)
@@ -186,9 +189,11 @@ class _Scan:
         highway = self.tags.get("highway", "")
         if highway in ON_FOOT:
             self.on_foot += 1
-        elif highway:
+        elif highway and highway not in NO_STREET:
             self.roads += 1
-            if any(key.split(":")[0] == "sidewalk" for key in self.tags):
+            tagged = any(key.split(":")[0] == "sidewalk" for key in self.tags)
+            self.fast += highway in FAST and not tagged
+            if tagged:
                 self.tagged.add(self.way)
         self.way = None
 
@@ -209,6 +214,11 @@ def osm_facts(file: MapFile) -> OsmFacts:
         raise MapError(
             f"{file.source}: an OpenStreetMap file of {len(scan.lonlat)} nodes and {scan.ways} ways, none of them a "
             "street or path (highway=*): export a larger area"
+        )
+    if not scan.on_foot and scan.fast == scan.roads:
+        raise MapError(
+            f"{file.source}: nothing walkable: {scan.roads} motorways and trunk roads, no other street or path: export "
+            "a town"
         )
     lonlat = np.array(scan.lonlat)
     lon, lat = (float(v) for v in np.median(lonlat, axis=0))
