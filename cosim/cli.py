@@ -53,7 +53,8 @@ COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
     epilog="Examples:  \n"
     "`cosim run long-horizon --policy route --episodes 2`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
-    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
+    "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`"
 )
 def run(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
@@ -63,6 +64,10 @@ def run(
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="Draw routes on this map (`cosim map list`) in place of the suite's.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the routes drawn with --map.")] = 0,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
 ) -> None:
     """Run a suite with a policy and print its table."""
@@ -73,7 +78,12 @@ def run(
     from scenarios.catalog import suite as shipped
     from scenarios.pool import run_all
 
-    whole = shipped(suite)
+    if map_name is not None:
+        from scenarios.sample import suite_on_map
+
+        whole = suite_on_map(suite, map_name, seed, episodes or 1)
+    else:
+        whole = shipped(suite)
     picked = chosen(whole, scenario or (), episodes)
     manifest = load_policy(policy).manifest
     spec = RunSpec(

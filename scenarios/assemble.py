@@ -19,13 +19,14 @@ from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.loop import Parts
 from cosim.ports import Director, Policy
-from cosim.scenario import City, Scenario
+from cosim.scenario import City, Place, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
 from physics.camera import BulletCamera
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
 from sumo_nets.crowd import SumoCrowd
+from sumo_nets.mapstore import map_net
 from sumo_nets.netfile import read_net
 from sumo_nets.store import city_net
 
@@ -81,7 +82,7 @@ def directed(env: str) -> Iterator[Director]:
 
 
 @lru_cache(maxsize=1)
-def place(city: City) -> tuple[Path, StreetMap]:
+def place(where: Place) -> tuple[Path, StreetMap]:
     """The net of a place and what was read from it; the last one is kept."""
-    path = city_net(city)
+    path = city_net(where) if isinstance(where, City) else map_net(where)
     return path, read_net(path)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import msgspec
 import numpy as np
 
 from cosim.errors import CosimError, MapError, SpecError
 from cosim.events import Event, Kind
 from cosim.geometry import Polyline
-from cosim.scenario import City, CrowdSpec, RouteCrossing, Scenario
+from cosim.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
@@ -32,9 +33,9 @@ EVENT_BEND_M = 0.4
 TRIES = 400
 
 
-def build(city: City, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
+def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
     """A scenario drawn from `seed`. Raises SpecError when none of many draws has exactly one path to the goal."""
-    rng = np.random.default_rng([seed, city.seed, 0x10E6])
+    rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = sorted(
         strip_id
         for strip_id in graph.main_strips
@@ -45,7 +46,7 @@ def build(city: City, street_map: StreetMap, graph: WalkGraph, seed: int, scenar
     refusals: dict[str, int] = {}
     for _ in range(TRIES):
         try:
-            return _draw(city, street_map, graph, rng, candidates, seed, scenario_id)
+            return _draw(place, street_map, graph, rng, candidates, seed, scenario_id)
         except CosimError as refusal:
             reason = str(refusal).split(":")[0]
             refusals[reason] = refusals.get(reason, 0) + 1
@@ -54,7 +55,7 @@ def build(city: City, street_map: StreetMap, graph: WalkGraph, seed: int, scenar
 
 
 def _draw(
-    city: City,
+    place: Place,
     street_map: StreetMap,
     graph: WalkGraph,
     rng: np.random.Generator,
@@ -72,7 +73,7 @@ def _draw(
     return Scenario(
         id=scenario_id,
         suite="long-horizon",
-        place=City(seed=city.seed, size_m=city.size_m, style=city.style, net_hash=street_map.net_hash),
+        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
         seed=seed,
         start=(start.x_m, start.y_m, start.heading_rad),
         goal=(goal.x_m, goal.y_m),
