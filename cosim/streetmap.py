@@ -42,6 +42,7 @@ class Strip:
     id: SUMO edge id. corners: ids of the corners at either end, None at a dead end. signalised and crosses
     (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and gutter), verge_m and
     street_class for sidewalks. road_side: +1 when the road lies left of `line`, -1 right, 0 when there is none.
+    driveways: arc lengths of `line`, in metres, where a driveway's middle crosses the sidewalk.
     """
 
     id: str
@@ -57,6 +58,7 @@ class Strip:
     curb_m: float = 0.3
     verge_m: float = 0.0
     road_side: int = 1
+    driveways: tuple[float, ...] = ()
 
     @property
     def length_m(self) -> float:

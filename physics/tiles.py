@@ -1,7 +1,8 @@
 """The ground: a StreetMap cut into square tiles of triangles, each built alone and alike from either side.
 
-Road and crossings lie at height 0, everything else at CURB_M above; towards a crossing the high ground sinks with
-a slope of 1:12, so that a curb ramp and its flares come from one formula: min(CURB_M, distance / 12).
+Road and crossings lie at height 0, everything else at CURB_M above; towards a crossing, and towards the mouth of a
+driveway, the high ground sinks with a slope of 1:12, so that a curb ramp and its flares come from one formula:
+min(CURB_M, distance / 12).
 
 A tile is one planar arrangement: all outlines are noded together on a millimetre grid, the faces between them
 are classified and triangulated. Neighbouring faces share their vertices, so there are no cracks.
@@ -27,6 +28,8 @@ CURB_M: Final = 0.12
 RAMP_SLOPE: Final = 1.0 / 12.0
 RAMP_M: Final = CURB_M / RAMP_SLOPE
 CURBSTONE_M: Final = 0.15
+DRIVEWAY_M: Final = 3.0
+"""Width of a driveway where it meets the road."""
 STRIPE_M: Final = 0.5
 """Length of a zebra stripe, and of the gap after it, along the crossing."""
 
@@ -55,7 +58,7 @@ Key = tuple[int, int]
 @dataclass(frozen=True, slots=True)
 class Tile:
     """One square of ground. parts: kind of SURFACES -> mesh; low: road and crossings; crossings: all that ramps
-    lead to. Both reach RAMP_M and more beyond the square."""
+    lead to, mouths of driveways included. Both reach RAMP_M and more beyond the square."""
 
     key: Key
     parts: Mapping[str, Mesh]
@@ -108,7 +111,8 @@ def build_tile(street_map: StreetMap, key: Key) -> Tile:
 def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, shapely.Geometry], shapely.Geometry]:
     """Disjoint areas within `reach` (pavement before crossing before road before verge), and the zebra stripes.
 
-    "ramp_to" is the union of the crossings, also where pavement covers them.
+    "ramp_to" is the union of the crossings, also where pavement covers them, and of the mouths of the driveways;
+    "apron" is where driveways cross the verge.
     """
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
     lanes = street_map.near("lane", reach)
@@ -120,16 +124,32 @@ def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, sha
     crossings = [s for s in strips if s.kind == "crossing"]
 
     pavement = _union([*sidewalks, *corners], reach)
-    ramp_to = _union([s.polygon for s in crossings], reach, closed=False)
-    crossing = shapely.difference(ramp_to, pavement)
-    road = shapely.difference(_union(roads, reach), shapely.union(pavement, ramp_to))
-    verge = shapely.difference(_union(verges, reach), shapely.union_all([pavement, ramp_to, road]))
+    zebras = _union([s.polygon for s in crossings], reach, closed=False)
+    crossing = shapely.difference(zebras, pavement)
+    road = shapely.difference(_union(roads, reach), shapely.union(pavement, zebras))
+    verge = shapely.difference(_union(verges, reach), shapely.union_all([pavement, zebras, road]))
+    mouths = [_driveway(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
+    aprons = [_driveway(s, at_m, -s.verge_m, 0.0) for s in strips for at_m in s.driveways if s.verge_m]
+    apron = shapely.intersection(_union(aprons, reach, closed=False), verge)
+    ramp_to = shapely.union(zebras, _union(mouths, reach, closed=False))
+    verge = shapely.difference(verge, apron)
     bars = [_stripes(s) for s in crossings]
     stripes = shapely.intersection(shapely.union_all(bars), crossing)
-    zones = {"pavement": pavement, "crossing": crossing, "road": road, "verge": verge, "ramp_to": ramp_to}
+    zones = {"pavement": pavement, "crossing": crossing, "road": road, "verge": verge, "apron": apron}
+    zones["ramp_to"] = ramp_to
     for zone in (*zones.values(), stripes):
         shapely.prepare(zone)
     return zones, stripes
+
+
+def _driveway(strip: Strip, at_m: float, from_m: float, to_m: float) -> shapely.Polygon:
+    """The part of a driveway between two distances from the road's edge, positive on the road."""
+    x, y, heading = Polyline(strip.line).at(at_m)
+    road = strip.road_side * (0.5 * strip.width_m + strip.verge_m)
+    along = 0.5 * DRIVEWAY_M * np.array([math.cos(heading), math.sin(heading)])
+    aside = np.array([-math.sin(heading), math.cos(heading)])
+    near, far = (np.array([x, y]) + (road + strip.road_side * d) * aside for d in (from_m, to_m))
+    return shapely.Polygon([near - along, near + along, far + along, far - along])
 
 
 def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Geometry]:
@@ -174,7 +194,9 @@ def _faces(
     contours = [shapely.buffer(zones["ramp_to"], share * RAMP_M, quad_segs=3) for share in (0.5, 1.0)]
     curbstone = shapely.buffer(zones["road"], CURBSTONE_M, join_style="mitre", mitre_limit=2.0)
     on_high = shapely.difference(shapely.boundary(np.array([*contours, curbstone], dtype=object)), low)
-    outlines = shapely.boundary(np.array([*(zones[k] for k in ("pavement", "crossing", "road", "verge")), stripes]))
+    outlines = shapely.boundary(
+        np.array([*(zones[k] for k in ("pavement", "crossing", "road", "verge", "apron")), stripes])
+    )
     inside = shapely.intersection(np.concatenate([on_high, outlines]), border)
     lines = [part for part in shapely.get_parts(inside) if shapely.get_dimensions(part) == 1]
     noded = shapely.union_all([*lines, shapely.boundary(border)], grid_size=_GRID_M)
@@ -192,6 +214,7 @@ def _classify(
     pavement = shapely.contains_xy(zones["pavement"], x, y)
     kind[pavement] = "sidewalk"
     kind[pavement & (_raised(point, zones["ramp_to"]) < CURB_M - 1e-6)] = "ramp"
+    kind[shapely.contains_xy(zones["apron"], x, y)] = "ramp"
     points = shapely.points(point)
     kind[shapely.distance(points, zones["road"]) < CURBSTONE_M] = "curb"
     kind[shapely.contains_xy(zones["road"], x, y)] = "road"

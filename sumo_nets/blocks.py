@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
+import numpy as np
+
 Point = tuple[float, float]
 Line = list[Point]
 
@@ -18,29 +20,88 @@ STEP_M = 6.0
 """Spacing of the points of a curved line."""
 
 
-class StreetClass(NamedTuple):
-    """Cross-section of a street, from its middle outwards, per direction."""
+class Section(NamedTuple):
+    """Cross-section of a street from its middle outwards, per direction: half of the island in the middle, lanes,
+    gutter and curb (both drawn within the lanes and the verge), verge, sidewalk, frontage."""
 
+    median_m: float
     lanes: int
     lane_m: float
-    speed_mps: float
+    gutter_m: float
+    curb_m: float
     verge_m: float
     sidewalk_m: float
     frontage_m: float
-    curb_m: float
-    gutter_m: float
-    priority: int
 
+    @property
+    def half_m(self) -> float:
+        """From the middle of the street to the outer edge of the sidewalk."""
+        return self.median_m + self.lanes * self.lane_m + self.verge_m + self.sidewalk_m
+
+
+Range = tuple[float, float]
+
+
+class StreetClass(NamedTuple):
+    """What streets of a class have in common: lanes per direction, ranges of widths in metres.
+
+    sidewalks_m: widths to choose from, odd multiples of SUMO's 0.64 m stripes, or walkers jump sideways at corners.
+    driveways: per metre of sidewalk.
+    """
+
+    lanes: int
+    speed_mps: float
+    priority: int
+    lane_m: Range
+    verge_m: Range
+    sidewalks_m: tuple[float, ...]
+    frontage_m: Range
+    curb_m: Range
+    gutter_m: Range
+    median_m: Range = (0.0, 0.0)
+    crossings_m: tuple[float, ...] = (3.2,)
+    driveways: float = 0.0
+
+    def section(self, rng: np.random.Generator) -> Section:
+        """A cross-section within the ranges, in steps of 5 cm."""
+
+        def within(span: Range) -> float:
+            return round(round(float(rng.uniform(*span)) / 0.05) * 0.05, 2)
+
+        return Section(
+            median_m=within(self.median_m),
+            lanes=self.lanes,
+            lane_m=within(self.lane_m),
+            gutter_m=within(self.gutter_m),
+            curb_m=within(self.curb_m),
+            verge_m=within(self.verge_m),
+            sidewalk_m=self.sidewalks_m[int(rng.integers(len(self.sidewalks_m)))],
+            frontage_m=within(self.frontage_m),
+        )
+
+
+STRIPE_M = 0.64
+"""Width of the stripes in which SUMO's walkers keep: walkways are an odd number of them wide."""
 
 CLASSES = {
-    "residential": StreetClass(1, 3.2, 8.33, 1.6, 3.2, 3.0, 0.15, 0.30, 3),
-    "commercial": StreetClass(1, 3.5, 8.33, 0.0, 4.48, 1.0, 0.20, 0.30, 4),
-    "avenue": StreetClass(2, 3.2, 13.89, 1.6, 3.2, 2.0, 0.20, 0.45, 6),
-    "boulevard": StreetClass(2, 3.3, 13.89, 2.4, 4.48, 3.0, 0.20, 0.45, 7),
-    "narrow": StreetClass(1, 3.0, 5.56, 0.0, 1.92, 0.6, 0.12, 0.20, 2),
-    "ring": StreetClass(1, 4.5, 6.94, 0.0, 3.2, 1.0, 0.15, 0.30, 5),
+    "residential": StreetClass(
+        1, 8.33, 3, (3.0, 3.4), (1.2, 2.2), (1.92, 3.2, 3.2), (2.0, 4.5), (0.1, 0.2), (0.25, 0.4), driveways=1 / 50
+    ),
+    "commercial": StreetClass(
+        1, 8.33, 4, (3.2, 3.6), (0.8, 1.4), (3.2, 4.48, 5.76), (0.6, 1.6), (0.15, 0.25), (0.25, 0.4), driveways=1 / 200
+    ),
+    "avenue": StreetClass(
+        2, 13.89, 6, (3.1, 3.4), (1.2, 2.0), (3.2, 4.48), (1.0, 3.0), (0.15, 0.25), (0.3, 0.5), (0.6, 0.9), (3.2, 4.48)
+    ),
+    "boulevard": StreetClass(
+        2, 13.89, 7, (3.2, 3.5), (1.8, 3.0), (4.48, 5.76), (2.0, 4.0), (0.15, 0.25), (0.3, 0.5), (1.0, 1.5), (4.48,)
+    ),
+    "narrow": StreetClass(
+        1, 5.56, 2, (2.8, 3.1), (0.3, 0.5), (1.92,), (0.4, 0.8), (0.1, 0.15), (0.15, 0.25), driveways=1 / 150
+    ),
+    "ring": StreetClass(1, 6.94, 5, (4.3, 4.7), (0.6, 1.2), (3.2,), (0.8, 1.5), (0.1, 0.2), (0.25, 0.4)),
 }
-"""Sidewalks are odd multiples of SUMO's 0.64 m stripes, or walkers jump sideways at every corner."""
+"""Streets of two lanes and more per direction have an island in their middle, a refuge for who crosses."""
 
 
 def polar(centre: Point, radius_m: float, angle_rad: float) -> Point:

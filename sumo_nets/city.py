@@ -1,31 +1,36 @@
 """A whole city from a seed: a jittered lattice with streets removed, bent, joined by roundabouts and crosswalks.
 
-The plan is pure geometry and topology; `sumo_nets.store` makes a street net of it. A street class runs along a whole
-row or column of the lattice. Metres, x east, y north; the city fills the square from 0, 0 to size_m, size_m.
+The plan is pure geometry and topology; `sumo_nets.store` makes a street net of it. A street class and its widths run
+along a whole row or column of the lattice. Metres, x east, y north; the city fills the square from 0, 0 to size_m,
+size_m.
 """
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
-from dataclasses import dataclass, field
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from cosim.errors import MapError, unknown
-from sumo_nets.blocks import CLASSES, Line, Point, bend, corner, direction, length, polar, ring, split, straight
+from sumo_nets.blocks import CLASSES
+from sumo_nets.draft import Cell, Draft, Link
+from sumo_nets.plan import CityPlan, plan_of
 
 SIZE_M = (200.0, 4000.0)
 """Smallest and largest city."""
-PITCH_M = 112.0
+PITCH_M = (102.0, 126.0)
 MARGIN_M = 22.0
+ROUNDABOUT_BLOCKS = 70
+"""At least one roundabout for so many blocks."""
 CLEAR_RAD = math.radians(58.0)
 """Smallest angle between two arms of a junction."""
 
 
 class Style(NamedTuple):
-    """Shares of what a city is made of; classes: weight of each street class among rows and columns."""
+    """Shares of what cities are made of, on average; classes: weight of each street class among rows and columns."""
 
     classes: dict[str, float]
     jitter: float
@@ -48,96 +53,21 @@ STYLES = {
     "suburb": Style(SUBURB, 0.28, 0.18, 0.05, 0.55, 0.55, 0.15, 0.15, 0.15),
 }
 
-Cell = tuple[int, int]
-PURPOSES = ("lattice", "classes", "diagonals", "removal", "shapes", "roundabouts", "crosswalks", "lights", "signals")
-
-
-class Node(NamedTuple):
-    """A junction. signalised: with traffic lights."""
-
-    id: str
-    at: Point
-    signalised: bool
-
-
-class Edge(NamedTuple):
-    """One direction of a street."""
-
-    id: str
-    tail: str
-    head: str
-    street_class: str
-    line: Line
-
-
-class Zebra(NamedTuple):
-    """A crossing over the given edges at a node."""
-
-    node: str
-    edges: tuple[str, ...]
-
-
-class Ring(NamedTuple):
-    """A roundabout's nodes and edges."""
-
-    nodes: tuple[str, ...]
-    edges: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CityPlan:
-    """What is built: signal_rng draws the signal programs' times."""
-
-    nodes: tuple[Node, ...]
-    edges: tuple[Edge, ...]
-    zebras: tuple[Zebra, ...]
-    rings: tuple[Ring, ...]
-    signal_rng: np.random.Generator
-
-
-@dataclass(slots=True)
-class _Link:
-    """A street between lattice points while the plan is drawn. turns: left turn off the chord at either end."""
-
-    a: Cell
-    b: Cell
-    street_class: str
-    via: Cell | None = None
-    turns: tuple[float, float] = (0.0, 0.0)
-
-
-@dataclass(slots=True)
-class _Draft:
-    at: dict[Cell, Point]
-    links: list[_Link]
-    rings: dict[Cell, float] = field(default_factory=dict)
-
-    def arms(self) -> dict[Cell, list[_Link]]:
-        arms: dict[Cell, list[_Link]] = {cell: [] for cell in self.at}
-        for link in self.links:
-            arms[link.a].append(link)
-            arms[link.b].append(link)
-        return arms
-
-    def leaving(self, link: _Link, cell: Cell) -> float:
-        """Heading with which `link` leaves the point of `cell`."""
-        far = link.b if cell == link.a else link.a
-        chord = direction(self.at[cell], self.at[far if link.via is None else link.via])
-        return chord + link.turns[0 if cell == link.a else 1]
-
-    def gap(self, cell: Cell, arms: list[_Link]) -> float:
-        """Smallest angle between two arms."""
-        headings = sorted(self.leaving(link, cell) % (2.0 * math.pi) for link in arms)
-        around = [*headings[1:], headings[0] + 2.0 * math.pi]
-        return min(b - a for a, b in zip(headings, around, strict=True))
-
-    def on_border(self, *cells: Cell) -> bool:
-        """Whether all cells lie on one side of the lattice."""
-        last = max(self.at)[0]
-        return any({cell[axis] for cell in cells} == {side} for axis in (0, 1) for side in (0, last))
-
-    def chord(self, link: _Link) -> float:
-        return math.dist(self.at[link.a], self.at[link.b])
+PURPOSES = (
+    "character",
+    "lattice",
+    "classes",
+    "widths",
+    "diagonals",
+    "removal",
+    "shapes",
+    "roundabouts",
+    "crosswalks",
+    "lights",
+    "driveways",
+    "signals",
+)
+"""Each has a random generator of its own."""
 
 
 def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
@@ -148,38 +78,82 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
         raise MapError(f"a city's size_m must be in [{SIZE_M[0]:g}, {SIZE_M[1]:g}], not {size_m:g}")
     if seed < 0:
         raise MapError(f"a city's seed cannot be negative: {seed}")
-    made_of = STYLES[style]
     entropy = (seed, round(size_m * 100), sorted(STYLES).index(style))
     seeds = np.random.SeedSequence(entropy).spawn(len(PURPOSES))
     rngs = {purpose: np.random.default_rng(s) for purpose, s in zip(PURPOSES, seeds, strict=True)}
-    draft = _lattice(rngs["lattice"], rngs["classes"], size_m, made_of)
+    made_of, pitch_m = _character(rngs["character"], STYLES[style])
+    draft = _lattice(rngs["lattice"], rngs["classes"], rngs["widths"], size_m, pitch_m, made_of)
     _diagonals(draft, rngs["diagonals"], made_of.diagonals)
     _remove(draft, rngs["removal"], made_of.removed)
     _dissolve(draft)
     _bend_streets(draft, rngs["shapes"], made_of)
     _place_roundabouts(draft, rngs["roundabouts"], made_of.roundabouts)
-    return _emit(draft, rngs["crosswalks"], rngs["lights"], made_of.crosswalks, rngs["signals"])
+    return plan_of(draft, rngs, made_of.crosswalks)
 
 
-def _lattice(rng: np.random.Generator, class_rng: np.random.Generator, size_m: float, style: Style) -> _Draft:
-    cells = max(2, round((size_m - 2.0 * MARGIN_M) / PITCH_M))
-    pitch = (size_m - 2.0 * MARGIN_M) / cells
-    sway = style.jitter * (pitch - 55.0)
-    at: dict[Cell, Point] = {}
-    for i in range(cells + 1):
-        for j in range(cells + 1):
-            dx, dy = rng.uniform(-sway, sway, 2)
+def _character(rng: np.random.Generator, style: Style) -> tuple[Style, float]:
+    """What one city of a style is made of, and how far apart its streets are: cities differ as a whole too."""
+    classes = {name: weight * float(rng.uniform(0.4, 1.6)) for name, weight in style.classes.items()}
+    shares = [share * float(rng.uniform(0.6, 1.4)) for share in style[2:]]
+    jitter = style.jitter * float(rng.uniform(0.5, 1.1))
+    return Style(classes, jitter, *shares), float(rng.uniform(*PITCH_M))
+
+
+def _lattice(
+    rng: np.random.Generator,
+    class_rng: np.random.Generator,
+    width_rng: np.random.Generator,
+    size_m: float,
+    pitch_m: float,
+    style: Style,
+) -> Draft:
+    cells = max(2, round((size_m - 2.0 * MARGIN_M) / pitch_m))
+    xs, ys = (_spaced(rng, cells, size_m) for _ in range(2))
+    sway = style.jitter * (min(b - a for line in (xs, ys) for a, b in pairwise(line)) - 55.0)
+    wave_x, wave_y = (_Wave.draw(rng, size_m) for _ in range(2))
+    at: dict[Cell, tuple[float, float]] = {}
+    for i, x in enumerate(xs):
+        for j, y in enumerate(ys):
+            dx, dy = (float(d) for d in rng.uniform(-sway, sway, 2))
             # The border stays straight enough to remain inside the square.
             dx, dy = dx * (0.3 if i in (0, cells) else 1.0), dy * (0.3 if j in (0, cells) else 1.0)
-            at[i, j] = (MARGIN_M + i * pitch + float(dx), MARGIN_M + j * pitch + float(dy))
+            at[i, j] = (x + dx + wave_x.shift(x, y, size_m), y + dy + wave_y.shift(y, x, size_m))
     names, weights = list(style.classes), np.array(list(style.classes.values()))
     rows, columns = (class_rng.choice(names, cells + 1, p=weights / weights.sum()).tolist() for _ in range(2))
-    links = [_Link((i, j), (i + 1, j), rows[j]) for i in range(cells) for j in range(cells + 1)]
-    links += [_Link((i, j), (i, j + 1), columns[i]) for i in range(cells + 1) for j in range(cells)]
-    return _Draft(at, links)
+    across, along = ([CLASSES[name].section(width_rng) for name in line] for line in (rows, columns))
+    links = [Link((i, j), (i + 1, j), rows[j], across[j]) for i in range(cells) for j in range(cells + 1)]
+    links += [Link((i, j), (i, j + 1), columns[i], along[i]) for i in range(cells + 1) for j in range(cells)]
+    return Draft(at, links)
 
 
-def _diagonals(draft: _Draft, rng: np.random.Generator, share: float) -> None:
+def _spaced(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
+    """Where the rows or columns lie: unevenly, but never so close that a block has no room."""
+    pitch = (size_m - 2.0 * MARGIN_M) / cells
+    loose = max(0.0, 0.6 * (pitch - 75.0))
+    gaps = [pitch + float(rng.uniform(-loose, loose)) for _ in range(cells)]
+    scale = (size_m - 2.0 * MARGIN_M) / sum(gaps)
+    return [MARGIN_M + scale * sum(gaps[:k]) for k in range(cells + 1)]
+
+
+class _Wave(NamedTuple):
+    """A slow bend of the whole lattice, none at the city's border."""
+
+    height_m: float
+    length_m: float
+    phase_rad: float
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, size_m: float) -> _Wave:
+        length_m = float(rng.uniform(0.6, 1.2)) * size_m
+        return cls(length_m * float(rng.uniform(0.0, 0.03)), length_m, float(rng.uniform(0.0, 2.0 * math.pi)))
+
+    def shift(self, along_m: float, across_m: float, size_m: float) -> float:
+        """How far a point moves along one axis."""
+        inside = math.sin(math.pi * (along_m - MARGIN_M) / (size_m - 2.0 * MARGIN_M))
+        return self.height_m * inside * math.sin(2.0 * math.pi * across_m / self.length_m + self.phase_rad)
+
+
+def _diagonals(draft: Draft, rng: np.random.Generator, share: float) -> None:
     """Replace two opposite sides of some blocks by one slanting street, which makes Y junctions."""
     last = max(draft.at)[0]
     blocks = [(i, j) for i in range(1, last - 1) for j in range(1, last - 1)]
@@ -199,7 +173,8 @@ def _diagonals(draft: _Draft, rng: np.random.Generator, share: float) -> None:
         kept = [link for link in draft.links if link not in dropped]
         for degrees in (14.0, 20.0, 26.0):
             turn = math.radians(degrees if rising != across else -degrees)
-            trial = _Draft(draft.at, [*kept, _Link(a, b, dropped[0].street_class, turns=(turn, turn))])
+            slant = Link(a, b, dropped[0].street_class, dropped[0].section, turns=(turn, turn))
+            trial = Draft(draft.at, [*kept, slant])
             arms = trial.arms()
             if min(trial.gap(a, arms[a]), trial.gap(b, arms[b])) >= CLEAR_RAD:
                 draft.links = trial.links
@@ -207,7 +182,7 @@ def _diagonals(draft: _Draft, rng: np.random.Generator, share: float) -> None:
                 break
 
 
-def _remove(draft: _Draft, rng: np.random.Generator, share: float) -> None:
+def _remove(draft: Draft, rng: np.random.Generator, share: float) -> None:
     """Remove a share of the streets; the rest stays one network without dead ends."""
     neighbours: dict[Cell, set[Cell]] = defaultdict(set)
     for link in draft.links:
@@ -251,21 +226,21 @@ def _reaches(neighbours: dict[Cell, set[Cell]], start: Cell, goal: Cell) -> bool
     return False
 
 
-def _dissolve(draft: _Draft) -> None:
+def _dissolve(draft: Draft) -> None:
     """Join the two streets of every point with two arms into one with a rounded corner."""
     for cell, arms in draft.arms().items():
         if len(arms) != 2:
             continue
         one, two = arms
-        if one.via is not None or two.via is not None or one.turns != (0.0, 0.0) or two.turns != (0.0, 0.0):
+        if not (one.plain and two.plain):
             continue
         a = one.a if one.b == cell else one.b
         b = two.a if two.b == cell else two.b
-        draft.links[draft.links.index(one)] = _Link(a, b, one.street_class, via=cell)
+        draft.links[draft.links.index(one)] = Link(a, b, one.street_class, one.section, via=cell)
         draft.links.remove(two)
 
 
-def _bend_streets(draft: _Draft, rng: np.random.Generator, style: Style) -> None:
+def _bend_streets(draft: Draft, rng: np.random.Generator, style: Style) -> None:
     """Y junctions, curves and S-bends, each only where every angle between arms stays wide."""
     arms = draft.arms()
     for cell, mine in arms.items():
@@ -287,7 +262,7 @@ def _bend_streets(draft: _Draft, rng: np.random.Generator, style: Style) -> None
             side = math.copysign(1.0, ((p - x) * (middle - y) - (q - y) * (middle - x)))
             draw = draw if draw < style.curves else 1.0
         turn = side * math.radians(rng.uniform(18.0, 42.0))
-        if link.via is not None or link.turns != (0.0, 0.0) or draw > style.curves + style.s_bends:
+        if not link.plain or draw > style.curves + style.s_bends:
             continue
         for factor in (1.0, 0.75, 0.5):
             link.turns = (factor * turn, factor * turn * (-1.0 if draw < style.curves else 1.0))
@@ -296,7 +271,7 @@ def _bend_streets(draft: _Draft, rng: np.random.Generator, style: Style) -> None
             link.turns = (0.0, 0.0)
 
 
-def _turn(draft: _Draft, arms: dict[Cell, list[_Link]], link: _Link, cell: Cell, turn: float) -> None:
+def _turn(draft: Draft, arms: dict[Cell, list[Link]], link: Link, cell: Cell, turn: float) -> None:
     if link.via is not None:
         return
     before, end = link.turns, 0 if link.a == cell else 1
@@ -305,93 +280,22 @@ def _turn(draft: _Draft, arms: dict[Cell, list[_Link]], link: _Link, cell: Cell,
         link.turns = before
 
 
-def _place_roundabouts(draft: _Draft, rng: np.random.Generator, share: float) -> None:
-    """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from each other."""
+def _place_roundabouts(draft: Draft, rng: np.random.Generator, share: float) -> None:
+    """Radii of the roundabouts, at interior junctions of quiet streets that are far enough from each other.
+
+    A large city has a few of them, whatever its share, where there is room.
+    """
     last, arms = max(draft.at)[0], draft.arms()
+    spare: dict[Cell, float] = {}
     for cell, mine in arms.items():
         radius, draw = float(rng.uniform(19.0, 22.0)), rng.random()
-        if draw > share or len(mine) < 3 or {0, last} & set(cell):
+        if len(mine) < 3 or {0, last} & set(cell):
             continue
         near = {end for link in mine for end in (link.a, link.b)}
         quiet = all(CLASSES[link.street_class].lanes == 1 and draft.chord(link) > 85.0 for link in mine)
         if quiet and not near & set(draft.rings) and draft.gap(cell, mine) > math.radians(74.0):
+            (spare if draw > share else draft.rings)[cell] = radius
+    for cell, radius in spare.items():
+        near = {end for link in arms[cell] for end in (link.a, link.b)}
+        if len(draft.rings) < last * last // ROUNDABOUT_BLOCKS and not near & set(draft.rings):
             draft.rings[cell] = radius
-
-
-def _emit(
-    draft: _Draft,
-    rng: np.random.Generator,
-    lights: np.random.Generator,
-    crosswalks: float,
-    signal_rng: np.random.Generator,
-) -> CityPlan:
-    nodes: dict[str, Node] = {}
-    edges: list[Edge] = []
-    rings: list[Ring] = []
-    joints: dict[tuple[Cell, int], Node] = {}
-    numbers = {id(link): number for number, link in enumerate(draft.links)}
-    for cell, arms in draft.arms().items():
-        name = f"n{cell[0]}x{cell[1]}"
-        draw = lights.random()
-        if cell in draft.rings:
-            order = sorted((draft.leaving(link, cell) % (2.0 * math.pi), numbers[id(link)]) for link in arms)
-            angles = [angle for angle, _ in order]
-            around = [
-                Node(f"{name}r{k}", polar(draft.at[cell], draft.rings[cell], a), False) for k, a in enumerate(angles)
-            ]
-            joints |= {(cell, link): node for (_, link), node in zip(order, around, strict=True)}
-            parts = [
-                Edge(f"{name}q{k}", around[k].id, around[(k + 1) % len(around)].id, "ring", line)
-                for k, line in enumerate(ring(draft.at[cell], draft.rings[cell], angles))
-            ]
-            edges += parts
-            rings.append(Ring(tuple(n.id for n in around), tuple(e.id for e in parts)))
-        elif arms:
-            wide = sum(CLASSES[link.street_class].lanes > 1 for link in arms)
-            node = Node(name, draft.at[cell], draw < (0.85 if wide else 0.25 if len(arms) > 3 else 0.08))
-            joints |= {(cell, numbers[id(link)]): node for link in arms}
-            around = [node]
-        else:
-            continue
-        nodes |= {node.id: node for node in around}
-    zebras: dict[str, list[tuple[str, str]]] = defaultdict(list)
-    for number, link in enumerate(draft.links):
-        tail, head = joints[link.a, number], joints[link.b, number]
-        line, name = _line(draft, link, tail.at, head.at), f"s{number}"
-        draws = rng.random(3).tolist()
-        blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
-        if length(line) > (106.0 if link.via is None else 180.0) + blocked and draws[0] < crosswalks:
-            # Well before the corner of a street that has one.
-            where = 0.45 + 0.1 * draws[1] if link.via is None else 0.27
-            first, second = split(line, where * length(line))
-            busy = CLASSES[link.street_class].lanes > 1
-            middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if busy else 0.25))
-            nodes[middle.id] = middle
-            zebras[middle.id].append((f"{name}a", f"-{name}a"))
-            pieces = [(f"{name}a", tail, middle, first), (f"{name}b", middle, head, second)]
-        else:
-            pieces = [(name, tail, head, line)]
-        for piece, start, end, shape in pieces:
-            edges.append(Edge(piece, start.id, end.id, link.street_class, shape))
-            edges.append(Edge(f"-{piece}", end.id, start.id, link.street_class, shape[::-1]))
-        for piece, start, end, _ in pieces:
-            for node in (start, end):
-                if node in (tail, head):
-                    zebras[node.id].append((piece, f"-{piece}"))
-    return CityPlan(
-        tuple(nodes.values()),
-        tuple(edges),
-        tuple(Zebra(node, pair) for node in nodes for pair in zebras[node]),
-        tuple(rings),
-        signal_rng,
-    )
-
-
-def _line(draft: _Draft, link: _Link, a: Point, b: Point) -> Line:
-    """The centre line between the points where the street starts and ends, a roundabout's rim included."""
-    leave, arrive = draft.leaving(link, link.a), draft.leaving(link, link.b) + math.pi
-    if link.via is not None:
-        return corner(a, draft.at[link.via], b, 32.0)
-    if link.turns == (0.0, 0.0):
-        return straight(a, b)
-    return bend(a, b, leave, arrive)

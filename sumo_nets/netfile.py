@@ -330,7 +330,16 @@ def _strip(
         curb_m=number("curb_m", 0.3 if side else 0.0) + number("gutter_m", 0.0),
         verge_m=number("verge_m", sum(verges)),
         road_side=side,
+        driveways=_driveways(edge.params.get("driveways", ""), line),
     )
+
+
+def _driveways(points: str, line: Floats) -> tuple[float, ...]:
+    """Arc lengths of a sidewalk's line beside points of its street's middle line."""
+    if not points:
+        return ()
+    at, _ = coordinates([points])
+    return tuple(np.round(shapely.line_locate_point(shapely.linestrings(line), shapely.points(at)), 3).tolist())
 
 
 def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:

@@ -20,6 +20,8 @@ WALK_S = 8
 """Shortest green of a crossing."""
 CLEARING_MPS = 1.1
 """Walking speed for which the road is kept clear after a crossing's green."""
+START_S = 3
+"""Who starts within so many seconds of green crosses at CLEARING_MPS before it ends."""
 YELLOW_S = 3
 ALL_RED_S = 2
 OPPOSITE_RAD = math.radians(38.0)
@@ -167,8 +169,9 @@ def _program(signal: _Signal, rng: np.random.Generator) -> list[Phase]:
     phases: list[Phase] = []
     for stage, walking in zip(stages, walks, strict=True):
         span = max((zebra.length_m for zebra in walking), default=0.0)
-        walk_s = max(WALK_S, math.ceil(0.6 * span))
         clear_s = math.ceil(span / CLEARING_MPS)
+        # Long enough to start late and still arrive within the green.
+        walk_s = max(WALK_S, clear_s + START_S)
         cars = [car for car in signal.cars if car.tail in stage]
         state = _green(signal, cars, walking)
         if not cars:

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 from cosim.errors import MapError
 from cosim.scenario import City
-from sumo_nets.blocks import CLASSES, Line
-from sumo_nets.city import CityPlan, Edge, plan_city
+from sumo_nets.blocks import CLASSES, Point
+from sumo_nets.city import plan_city
 from sumo_nets.netfile import net_content_hash, netconvert, without_comments
+from sumo_nets.plan import CityPlan, Edge
 from sumo_nets.signals import with_programs
 
-GENERATOR = 3
+GENERATOR = 4
 """Version of the generator: another one for every change that changes a net."""
 CROSSING_M = 3.2
 NETCONVERT = (
@@ -70,12 +72,13 @@ def _build(plan: CityPlan, folder: Path) -> Path:
     rows = []
     for node in plan.nodes:
         kind = "traffic_light" if node.signalised else "priority"
-        rows.append(f'<node id={quoteattr(node.id)} x="{node.at[0]:.2f}" y="{node.at[1]:.2f}" type="{kind}"/>')
+        shape = f' shape="{_shape(node.outline)}"' if node.outline else ""
+        rows.append(f'<node id={quoteattr(node.id)} x="{node.at[0]:.2f}" y="{node.at[1]:.2f}" type="{kind}"{shape}/>')
     nodes.write_text("<nodes>\n" + "\n".join(rows) + "\n</nodes>\n")
     rings = [f'<roundabout nodes="{" ".join(r.nodes)}" edges="{" ".join(r.edges)}"/>' for r in plan.rings]
     edges.write_text("<edges>\n" + "\n".join([*map(_edge, plan.edges), *rings]) + "\n</edges>\n")
     zebras = [
-        f'<crossing node="{z.node}" edges="{" ".join(z.edges)}" width="{CROSSING_M}" priority="true"/>'
+        f'<crossing node="{z.node}" edges="{" ".join(z.edges)}" width="{z.width_m}" priority="true"/>'
         for z in plan.zebras
     ]
     crossings.write_text("<connections>\n" + "\n".join(zebras) + "\n</connections>\n")
@@ -83,12 +86,15 @@ def _build(plan: CityPlan, folder: Path) -> Path:
 
 
 def _edge(edge: Edge) -> str:
-    """An edge with its sidewalk as lane 0, the verge next to it, then the lanes that are driven on."""
-    section = CLASSES[edge.street_class]
-    lanes = [f'allow="pedestrian" width="{section.sidewalk_m}"']
-    if section.verge_m:
-        lanes.append(f'disallow="all" width="{section.verge_m}" type="green_verge"')
-    lanes += [f'disallow="pedestrian" width="{section.lane_m}"'] * section.lanes
+    """An edge with its sidewalk as lane 0, the verge next to it, the lanes that are driven on, half of the island."""
+    made, section = CLASSES[edge.street_class], edge.section
+    lanes = [
+        f'allow="pedestrian" width="{section.sidewalk_m}"',
+        f'disallow="all" width="{section.verge_m}" type="green_verge"',
+        *[f'disallow="pedestrian" width="{section.lane_m}"'] * section.lanes,
+    ]
+    if section.median_m:
+        lanes.append(f'disallow="all" width="{section.median_m}" type="median"')
     numbered = "".join(f'<lane index="{i}" {lane}/>' for i, lane in enumerate(lanes))
     params = {
         "street_class": edge.street_class,
@@ -97,13 +103,15 @@ def _edge(edge: Edge) -> str:
         "curb_m": section.curb_m,
         "gutter_m": section.gutter_m,
     }
+    if edge.driveways:
+        params["driveways"] = _shape(edge.driveways)
     zones = "".join(f'<param key="{key}" value="{value}"/>' for key, value in params.items())
     return (
         f'<edge id={quoteattr(edge.id)} from="{edge.tail}" to="{edge.head}" numLanes="{len(lanes)}" '
-        f'speed="{section.speed_mps}" priority="{section.priority}" type="{edge.street_class}" spreadType="right" '
+        f'speed="{made.speed_mps}" priority="{made.priority}" type="{edge.street_class}" spreadType="right" '
         f'shape="{_shape(edge.line)}">{numbered}{zones}</edge>'
     )
 
 
-def _shape(line: Line) -> str:
+def _shape(line: Sequence[Point]) -> str:
     return " ".join(f"{x:.2f},{y:.2f}" for x, y in line)
