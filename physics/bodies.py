@@ -13,6 +13,7 @@ from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M, RobotState
 from physics.buildings import Building
+from physics.furniture import Prop, solids_of
 from physics.mesh import as_lists, join
 from physics.robots import RobotModel
 from physics.tiles import CURB_M, Tile
@@ -70,8 +71,11 @@ class Bodies:
     def close(self) -> None:
         p.disconnect(self._client)
 
-    def add_tile(self, tile: Tile, buildings: Sequence[Building]) -> list[int]:
-        """The ground of a tile and its buildings; returns what `remove` takes."""
+    def add_tile(
+        self, tile: Tile, buildings: Sequence[Building], props: Sequence[tuple[Prop, float]] = ()
+    ) -> list[int]:
+        """The ground of a tile, its buildings, and its props with the heights of their feet in metres; returns what
+        `remove` takes."""
         mesh = join(list(tile.parts.values()))
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
         flags = p.GEOM_FORCE_CONCAVE_TRIMESH
@@ -79,7 +83,8 @@ class Bodies:
             shape = self._do("createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags)
         ground = self._body(shape, middle)
         self._do("changeDynamics", ground, -1, lateralFriction=_GROUND_FRICTION)
-        return [ground, *(self._add_building(b) for b in buildings)]
+        things = [self._add_building(b) for b in buildings] + [self._add_prop(prop, z) for prop, z in props]
+        return [ground, *things]
 
     def _add_building(self, building: Building) -> int:
         half = [0.5 * s for s in building.size_m]
@@ -87,6 +92,23 @@ class Bodies:
         at = (building.x_m, building.y_m, CURB_M + half[2])
         body = self._body(shape, at, p.getQuaternionFromEuler((0.0, 0.0, building.heading_rad)))
         self._what[body] = ("wall", building.id)
+        return body
+
+    def _add_prop(self, prop: Prop, z_m: float) -> int:
+        pool = (prop.kind, prop.variant)
+        if pool not in self._shapes:
+            solids = solids_of(*pool)
+            self._shapes[pool] = self._do(
+                "createCollisionShapeArray",
+                shapeTypes=[p.GEOM_BOX if s.shape == "box" else p.GEOM_CYLINDER for s in solids],
+                halfExtents=[[0.5 * c for c in s.size_m] for s in solids],
+                radii=[0.5 * s.size_m[0] for s in solids],
+                lengths=[s.size_m[2] for s in solids],
+                collisionFramePositions=[[*s.at_m, 0.5 * s.size_m[2]] for s in solids],
+            )
+        turn = p.getQuaternionFromEuler((0.0, 0.0, prop.heading_rad))
+        body = self._body(self._shapes[pool], (prop.x_m, prop.y_m, z_m), turn)
+        self._what[body] = ("object", prop.id)
         return body
 
     def add_barrier(self, barrier: Barrier, z_m: float) -> int:

@@ -1,4 +1,4 @@
-"""The place as the engines ask for it: tiles and buildings by key, heights by point; built when first needed."""
+"""The place as the engines ask for it: tiles, buildings and props by key, heights by point; built when first needed."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike
 from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, Frontage
+from physics.furniture import Prop
+from physics.placement import Placement
 from physics.robots import RobotModel
 from physics.tiles import Key, Tile, build_tile, key_at
 
@@ -19,12 +21,13 @@ _KEPT: Final = 100
 
 
 class Ground:
-    """Tiles and buildings of a street map under a seed; the least recently used tiles are forgotten."""
+    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are forgotten."""
 
     def __init__(self, street_map: StreetMap, seed: int) -> None:
         self.street_map = street_map
         self.seed = seed
         self._frontage = Frontage(street_map, seed)
+        self._placement = Placement(street_map, seed, self._frontage)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
 
     def tile(self, key: Key) -> Tile:
@@ -38,6 +41,12 @@ class Ground:
     def buildings(self, key: Key) -> tuple[Building, ...]:
         """Buildings whose centre lies in the tile."""
         return self._frontage.in_tile(key)
+
+    def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
+        """Props whose middle lies in the tile, each with the height of its foot in metres."""
+        props = self._placement.in_tile(key)
+        heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
+        return tuple(zip(props, heights.tolist(), strict=True))
 
     def heights(self, xy: ArrayLike) -> Floats:
         """Height of the ground at (N, 2) points, (N,) metres."""

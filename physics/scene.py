@@ -1,4 +1,4 @@
-"""The street around a point as a canvas shows it: tiles, buildings, fences, signals, people, vehicles."""
+"""The street around a point as a canvas shows it: tiles, buildings, props, fences, signals, people, vehicles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from cosim.state import People, Street, Vehicles
 from cosim.streetmap import Strip
 from physics import people, props, vehicles
 from physics.buildings import FACADES, WINDOWS, facade_meshes
-from physics.canvas import Canvas, Rigs
+from physics.canvas import Canvas, Colour, Rigs
+from physics.furniture import KINDS, Prop, parts_of
 from physics.ground import Ground
 from physics.robots import RobotModel
 from physics.tiles import SURFACES, Key, distance_to, key_at, keys_within, square
@@ -46,10 +47,14 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class _TileBodies:
-    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in it."""
+    """A built tile. bodies: body -> where it belongs (x, y, z and heading); posts: the signals in it; furniture: its
+    props with the heights of their feet, at (N, 2) furniture_xy, drawn as far as (N,) seen_m."""
 
     bodies: dict[int, tuple[tuple[float, float, float], float]]
     posts: list[props.SignalPost]
+    furniture: tuple[tuple[Prop, float], ...]
+    furniture_xy: Floats
+    seen_m: Floats
 
 
 class Scene:
@@ -69,6 +74,8 @@ class Scene:
         self._walkers = Rigs(canvas, [part.mesh for part in people.PARTS], "person")
         self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
         self._vehicles: dict[tuple[float, float], Rigs] = {}
+        self._furniture: dict[tuple[str, int], Rigs] = {}
+        self._painted: dict[int, Colour] = {}
         self._robot = canvas.load(model.urdf, "robot")
         for barrier in barriers:
             z = float(ground.heights([[barrier.x_m, barrier.y_m]])[0])
@@ -82,6 +89,7 @@ class Scene:
         self._show_people(view, street.people, Clock().time_s(street.tick))
         self._show_vehicles(view, street.vehicles)
         self._show_signals(street)
+        self._show_furniture(view)
         self._canvas.put_away(self._robot)
 
     def show_robot(self, pose: Pose, z_m: float, roll_rad: float, pitch_rad: float) -> None:
@@ -124,7 +132,9 @@ class Scene:
         posts = [post for post in posts if key_at(post.x_m, post.y_m) == key]
         for post in posts:
             bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
-        return _TileBodies(bodies, posts)
+        furniture = self._ground.props(key)
+        xy = np.array([(prop.x_m, prop.y_m) for prop, _ in furniture]).reshape(-1, 2)
+        return _TileBodies(bodies, posts, furniture, xy, np.array([KINDS[prop.kind].seen_m for prop, _ in furniture]))
 
     def _foot(self, post: props.SignalPost) -> tuple[float, float, float]:
         return post.x_m, post.y_m, float(self._ground.heights([[post.x_m, post.y_m]])[0])
@@ -170,4 +180,29 @@ class Scene:
                     self._canvas.put(lamp, self._foot(post), post.heading_rad)
                     self._canvas.paint(lamp, props.LAMPS[walk])
         for rigs in self._lamps.values():
+            rigs.finish()
+
+    def _show_furniture(self, view: View) -> None:
+        """Props are lent their bodies like people: those out of the picture or far away cost nothing."""
+        for rigs in self._furniture.values():
+            rigs.start()
+        for key in sorted(self._shown):
+            tile = self._tiles[key]
+            if not tile.furniture:
+                continue
+            rows = view.rows(tile.furniture_xy, 2.5)
+            gap = np.hypot(*(tile.furniture_xy[rows] - view.eye_m[:2]).T)
+            for i in rows[gap < tile.seen_m[rows]].tolist():
+                prop, z = tile.furniture[i]
+                form = prop.kind, prop.variant
+                parts = parts_of(*form)
+                if form not in self._furniture:
+                    self._furniture[form] = Rigs(self._canvas, [part.mesh for part in parts], "prop")
+                for body, part in zip(self._furniture[form].lend(), parts, strict=True):
+                    self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.heading_rad)
+                    colour = part.colour or KINDS[prop.kind].paints[prop.paint]
+                    if self._painted.get(body) != colour:
+                        self._painted[body] = colour
+                        self._canvas.paint(body, colour)
+        for rigs in self._furniture.values():
             rigs.finish()

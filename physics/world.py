@@ -1,6 +1,6 @@
-"""BulletWorld: the robot among streets, buildings, barriers, people and vehicles, stepped by PyBullet.
+"""BulletWorld: the robot among streets, buildings, props, barriers, people and vehicles, stepped by PyBullet.
 
-Only what the robot can touch is in the engine: ground and buildings of the tiles around it, and the people and
+Only what the robot can touch is in the engine: ground, buildings and props of the tiles around it, and the people and
 vehicles within reach. Pictures are drawn elsewhere (physics.camera), from the same values.
 """
 
@@ -147,7 +147,7 @@ class BulletWorld:
         for key in keys_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
                 tile = self.ground.tile(key)
-                self._tiles[key] = bodies.add_tile(tile, self.ground.buildings(key))
+                self._tiles[key] = bodies.add_tile(tile, self.ground.buildings(key), self.ground.props(key))
 
     @property
     def _engine(self) -> Bodies:

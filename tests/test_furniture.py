@@ -1,0 +1,220 @@
+"""Street furniture: the catalogue, where it stands, what stays free, and the engine's bodies and pictures of it."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import math
+import os
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from cosim.geometry import Polyline, Pose
+from cosim.ports import CameraSpec
+from cosim.scenario import City
+from cosim.state import LABELS, Command, RobotState, Street
+from cosim.streetmap import StreetMap, Strip
+from physics.buildings import Frontage
+from physics.camera import BulletCamera
+from physics.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
+from physics.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, clear_width, street_style
+from physics.tiles import key_at, keys_within
+from physics.world import BulletWorld
+from sumo_nets.netfile import read_net
+from sumo_nets.store import city_net
+
+_spec = importlib.util.spec_from_file_location("tiles_of_tests", Path(__file__).with_name("test_tiles.py"))
+assert _spec is not None and _spec.loader is not None
+_tiles = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(_tiles)
+
+BASE = _tiles.tiny_map()
+CLASSES = {"nw": "commercial", "ne": "residential", "sw": "boulevard", "se": "narrow"}
+MAP: StreetMap = dataclasses.replace(
+    BASE,
+    strips={
+        name: dataclasses.replace(s, street_class=CLASSES.get(name, ""), verge_m=1.5 if name in ("sw", "se") else 0.0)
+        for name, s in BASE.strips.items()
+    },
+    _trees={},
+)
+EMPTY = Street(0)
+SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[2] / "shared")) / "maps"
+
+
+def placed(street_map: StreetMap, seed: int) -> tuple[Placement, Frontage]:
+    frontage = Frontage(street_map, seed)
+    return Placement(street_map, seed, frontage), frontage
+
+
+def sidewalks(street_map: StreetMap) -> list[Strip]:
+    return [s for s in street_map.strips.values() if s.kind == "sidewalk"]
+
+
+def all_props(street_map: StreetMap, seed: int) -> list[Prop]:
+    placement, _ = placed(street_map, seed)
+    return [prop for strip in sidewalks(street_map) for prop in placement.on_strip(strip)]
+
+
+@cache
+def city(seed: int, size_m: float = 600.0) -> StreetMap:
+    return read_net(city_net(City(seed=seed, size_m=size_m)))
+
+
+def foreign() -> list[Path]:
+    names = ("berlin-neukoelln", "taipei", "west-oakland")
+    return [net for name in names for net in sorted((SHARED / name).glob("*.net.xml.gz"))[:1]]
+
+
+@pytest.mark.parametrize("kind", CATALOGUE, ids=lambda kind: kind.name)
+def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
+    """Every size has few triangles, reaches the ground, fills its footprint below the heads and bumps within it."""
+    entry = KINDS[kind.name]  # type: ignore[attr-defined]
+    for variant in range(VARIANTS):
+        length, depth, height = entry.size_m(variant)
+        parts = parts_of(entry.name, variant)
+        vertices = np.concatenate([part.mesh.vertices for part in parts])
+        assert sum(len(part.mesh) for part in parts) <= (100 if entry.name == "tree" else 75)
+        assert -1e-9 <= vertices[:, 2].min() < 0.051
+        assert vertices[:, 2].max() == pytest.approx(height, abs=0.06)
+        low = vertices[vertices[:, 2] < 1.75] if entry.name != "shelter" else vertices[vertices[:, 2] < 2.0]
+        assert np.abs(low[:, 0]).max() <= 0.5 * length + 0.02
+        assert np.abs(low[:, 1]).max() <= 0.5 * depth + 0.02
+        for solid in solids_of(entry.name, variant):
+            assert abs(solid.at_m[0]) + 0.5 * solid.size_m[0] <= 0.5 * length + 1e-9
+            assert abs(solid.at_m[1]) + 0.5 * solid.size_m[1] <= 0.5 * depth + 1e-9
+
+
+def test_street_classes_of_any_map_have_a_column() -> None:
+    """Our own classes are themselves; types of imported edges go by their words; the rest are residential."""
+    assert street_style("boulevard") == "boulevard"
+    assert street_style("highway.primary_link") == "avenue"
+    assert street_style("highway.living_street") == "narrow"
+    assert street_style("highway.footway") == street_style("") == "residential"
+    assert all({*kind.per_100m} == {*CATALOGUE[0].per_100m} for kind in CATALOGUE)
+
+
+def test_props_keep_off_what_is_not_theirs() -> None:
+    """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a strip's end."""
+    street = shapely.union_all([p.polygon for p in (*MAP.corners.values(), *MAP.lanes.values()) if "_0" not in p.id])
+    zebra = MAP.strips[":c0"].polygon
+    for seed in range(6):
+        placement, frontage = placed(MAP, seed)
+        props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)]
+        ground = footprints(props)
+        assert len(props) > 25
+        assert shapely.distance(ground, street).min() > 0.0
+        assert shapely.distance(ground, zebra).min() >= END_M
+        assert len(shapely.STRtree(ground).query(ground, predicate="intersects")[0]) == len(ground)
+        houses = [b.polygon for key in keys_within(0.0, 0.0, 120.0) for b in frontage.in_tile(key)]
+        assert not len(shapely.STRtree(houses).query(ground, predicate="intersects")[0])
+        for prop, footprint in zip(props, ground, strict=True):
+            strip = MAP.strips[prop.id.split(":")[1]]
+            line = Polyline(strip.line)
+            along = [line.project(x, y)[0] for x, y in shapely.get_coordinates(footprint)]
+            assert min(along) >= END_M - 1e-6 and max(along) <= line.length_m - END_M + 1e-6
+
+
+def test_the_middle_of_a_sidewalk_is_free() -> None:
+    """No footprint comes nearer to the middle line than the clear half width, which is at least 0.6 m."""
+    for seed in range(6):
+        for prop, footprint in zip(props := all_props(MAP, seed), footprints(props), strict=True):
+            strip = MAP.strips[prop.id.split(":")[1]]
+            half = clear_half_m(strip)
+            assert half >= CLEAR_HALF_M
+            assert shapely.distance(shapely.linestrings(strip.line), footprint) >= half
+
+
+def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
+    """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives others."""
+    keys = keys_within(0.0, 0.0, 100.0)
+    one, two, other = (placed(MAP, seed)[0] for seed in (4, 4, 5))
+    forward = {key: one.in_tile(key) for key in keys}
+    backward = {key: two.in_tile(key) for key in reversed(keys)}
+    assert forward == backward
+    assert forward != {key: other.in_tile(key) for key in keys}
+    ids = [prop.id for props in forward.values() for prop in props]
+    assert len(ids) == len(set(ids)) == len(all_props(MAP, 4))
+    assert all(key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props)
+
+
+def test_streets_differ_by_their_class() -> None:
+    """Trees stand on boulevards and not in narrow streets, cafés rather in commercial ones; all kinds are found."""
+    found: dict[str, list[str]] = {}
+    for seed in range(12):
+        for prop in all_props(MAP, seed):
+            found.setdefault(CLASSES[prop.id.split(":")[1]], []).append(prop.kind)
+    assert found["boulevard"].count("tree") > 20 and "tree" not in found["narrow"]
+    assert found["commercial"].count("cafe") > found["residential"].count("cafe")
+    assert {kind for kinds in found.values() for kind in kinds} >= set(KINDS) - {"car", "shelter"}
+
+
+def test_the_checker_finds_a_prop_in_the_way() -> None:
+    """The least free width over the middle is measured at the prop, and is 0 where it stands on the middle line."""
+    strip = MAP.strips["nw"]
+    bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
+    width, bare = clear_width(MAP, [strip], [bench])["nw"]
+    assert (width, bare) == (pytest.approx(3.0 - 0.3 - 0.225), pytest.approx(3.0))
+    middle = dataclasses.replace(bench, y_m=5.0)
+    assert clear_width(MAP, [strip], [middle])["nw"][0] == 0.0
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("seed", [11, 37, 5])
+def test_generated_cities_leave_a_way(seed: int) -> None:
+    """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is furniture."""
+    street_map = city(seed)
+    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    widths = clear_width(street_map, strips, props)
+    assert min(free for free, _ in widths.values()) >= 1.2 - 1e-6
+    assert len(props) > 0.06 * sum(strip.length_m for strip in strips)
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not foreign(), reason="the shared maps are not here")
+@pytest.mark.parametrize("path", foreign(), ids=lambda path: path.parent.name)
+def test_foreign_maps_leave_a_way(path: Path) -> None:
+    """Props take nothing from a sidewalk below 1.2 m: what is narrower stays as it is."""
+    street_map = read_net(path)
+    widths = clear_width(street_map, sidewalks(street_map), all_props(street_map, 3))
+    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in widths.values())
+
+
+@pytest.mark.engine
+def test_a_prop_stops_the_robot_and_is_named() -> None:
+    """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does not pass."""
+    placement, _ = placed(MAP, 1)
+    chosen = {prop.kind: prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)}
+    assert len(chosen) > 8
+    with BulletWorld(MAP, seed=1) as world:
+        for prop in chosen.values():
+            y = MAP.strips[prop.id.split(":")[1]].line[0, 1]
+            toward = math.copysign(math.pi / 2, prop.y_m - y)
+            world.place(Pose(prop.x_m + 0.2, float(y), toward))
+            motions = [world.step(Command(0.6, 0.0), EMPTY, EMPTY, 10) for _ in range(120)]
+            contacts = {(c.kind, c.other) for motion in motions for c in motion.contacts}
+            assert contacts == {("object", prop.id)}, prop
+            assert abs(motions[-1].robot.pose.y_m - y) < abs(prop.y_m - y)
+
+
+@pytest.mark.engine
+def test_a_prop_is_seen_where_it_stands() -> None:
+    """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground, at its distance."""
+    placement, _ = placed(MAP, 1)
+    props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip) if prop.kind in ("bin", "planter")]
+    with BulletCamera(BulletWorld(MAP, seed=1), CameraSpec(96, 96), depth=True) as camera:
+        for prop in props[:4]:
+            y = float(MAP.strips[prop.id.split(":")[1]].line[0, 1])
+            toward = math.copysign(math.pi / 2, prop.y_m - y)
+            away = 3.0 * math.copysign(1.0, y - prop.y_m)
+            frame = camera.render(RobotState(Pose(prop.x_m, prop.y_m + away, toward), z_m=0.12), EMPTY)
+            assert frame.labels is not None and frame.depth is not None
+            rows = np.flatnonzero(frame.labels[:, 48] == LABELS["prop"])
+            assert len(rows) > 5
+            assert frame.labels[rows.max() + 1, 48] in (LABELS["verge"], LABELS["ground"])
+            nearest = 3.0 - 0.5 * prop.size_m[1] - frame.depth[rows, 48].min()
+            assert 0.0 < nearest < 0.5
