@@ -18,6 +18,7 @@ import shapely
 
 from cosim.errors import MapError, UsageError
 from cosim.mapcheck import NetFacts
+from sumo_nets.cornermend import mend_corners
 from sumo_nets.drivingside import left_hand_country
 from sumo_nets.netfacts import allows, facts_of, footway, net_root, read_facts
 from sumo_nets.netfile import netconvert, read_net
@@ -154,6 +155,10 @@ def _finish(
     ET.ElementTree(root).write(final, encoding="UTF-8", xml_declaration=True)
     facts = facts_of(root)
     street_map = read_net(final)
+    if mended := mend_corners(root, street_map):
+        changes += mended
+        ET.ElementTree(root).write(final, encoding="UTF-8", xml_declaration=True)
+        street_map = read_net(final)
     if not any(strip.kind == "sidewalk" for strip in street_map.strips.values()):
         raise MapError(
             f"{file.source}: nothing walkable in it: {facts.edges} edges, none with a sidewalk or path; import an area "

@@ -20,7 +20,10 @@ from hypothesis import strategies as st
 
 from cosim.errors import MapError, UsageError
 from cosim.scenario import City, CityMap
+from cosim.streetmap import Port
+from cosim.wayline import through_corner
 from sumo_nets import importer, mapstore
+from sumo_nets.cornermend import mend_corners
 from sumo_nets.drivingside import left_hand_country
 from sumo_nets.importer import Options
 from sumo_nets.mapstore import about_map, checked_map, import_map, known_maps, map_name, map_net, maps_folder, read_map
@@ -287,6 +290,34 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
     assert walks_of(root).never == [] and mend_signals(root) == []
     special = ET.fromstring(net.replace("static", "NEMA"))
     assert "left as they are" in mend_signals(special)[0] and walks_of(special).never == [":J_c0"]
+
+
+def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> None:
+    """A walking area that crosses itself between two sidewalks becomes ground a robot can pass; a whole one stays."""
+    net = """<net version="1.9"><location convBoundary="0,0,30,9"/>
+      <edge id=":J_w0" function="walkingarea"><lane id=":J_w0_0" allow="pedestrian" length="4" width="2"
+        shape="10,-1 14,1 14,-1 10,1"/></edge>
+      <edge id=":K_w0" function="walkingarea"><lane id=":K_w0_0" allow="pedestrian" length="4" width="2"
+        shape="24,-1 28,-1 28,1 24,1"/></edge>
+      <edge id="a"><lane id="a_0" allow="pedestrian" length="10" width="2" shape="0,0 10,0"/></edge>
+      <edge id="b"><lane id="b_0" allow="pedestrian" length="10" width="2" shape="14,0 24,0"/></edge>
+      <edge id="c"><lane id="c_0" allow="pedestrian" length="10" width="2" shape="28,0 38,0"/></edge>
+      <connection from="a" to=":J_w0" fromLane="0" toLane="0"/><connection from=":J_w0" to="b" fromLane="0" toLane="0"/>
+      <connection from="b" to=":K_w0" fromLane="0" toLane="0"/><connection from=":K_w0" to="c" fromLane="0" toLane="0"/>
+      </net>"""
+    path = written(tmp_path / "torn.net.xml", net)
+    root, leave, enter = ET.fromstring(net), Port("a", 1), Port("b", 0)
+    with pytest.raises(MapError, match="no line through corner ':J_w0'"):
+        through_corner(read_net(path), leave, enter)
+    assert mend_corners(root, read_net(path)) == [
+        "1 of 2 corners were torn or pinched: widened along the ways across them"
+    ]
+    path.write_bytes(ET.tostring(root))
+    mended = read_net(path)
+    assert through_corner(mended, leave, enter)[[0, -1]].tolist() == [[10.0, 0.0], [14.0, 0.0]]
+    assert mended.corners[":J_w0"].polygon.buffer(-0.4).geom_type == "Polygon"
+    assert [e[0].get("shape") for e in root if e.get("id") == ":K_w0"] == ["24,-1 28,-1 28,1 24,1"]
+    assert mend_corners(root, mended) == []
 
 
 @pytest.mark.engine
