@@ -23,6 +23,7 @@ from rich.progress import (
 )
 from rich.table import Column, Table
 
+from cosim.cli_city import city_app
 from cosim.cli_map import map_app
 from cosim.errors import CosimError, UsageError
 
@@ -33,6 +34,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
 )
+app.add_typer(city_app, name="city")
 app.add_typer(map_app, name="map")
 out = Console()
 err = Console(stderr=True)

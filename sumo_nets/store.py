@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tempfile
 from collections.abc import Sequence
+from importlib.metadata import version
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
+
+import msgspec
 
 from cosim.errors import MapError
 from cosim.scenario import City
@@ -18,6 +22,11 @@ from sumo_nets.signals import with_programs
 
 GENERATOR = 4
 """Version of the generator: another one for every change that changes a net."""
+NET_NAME = "city.net.xml"
+ABOUT_NAME = "city.json"
+MADE_WITH = ("sidewalk-cosim", "eclipse-sumo", "numpy")
+"""Packages that a net depends on."""
+SEAL = b"<!-- sha256 "
 CROSSING_M = 3.2
 NETCONVERT = (
     "--walkingareas",
@@ -37,12 +46,12 @@ def cache_folder() -> Path:
 
 
 def city_net(city: City) -> Path:
-    """The city's street net, built when the cache has none.
+    """The city's street net, built when the cache has none, or a damaged one.
 
     Raises MapError when `city.net_hash` is set and the net is another one.
     """
     path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
-    if not path.exists():
+    if not is_whole(path):
         build_city(city, path)
     if city.net_hash and (found := net_content_hash(path)) != city.net_hash:
         raise MapError(
@@ -53,6 +62,38 @@ def city_net(city: City) -> Path:
     return path
 
 
+def is_whole(path: Path) -> bool:
+    """Whether a net that was built here is still what was written: its last line holds the hash of all the others."""
+    try:
+        body, _, seal = path.read_bytes().rpartition(SEAL)
+    except OSError:
+        return False
+    return bool(body) and seal == _seal(body)
+
+
+def _seal(body: bytes) -> bytes:
+    return f"{hashlib.sha256(body).hexdigest()} -->\n".encode()
+
+
+def write_city(city: City, folder: Path) -> City:
+    """Write a city as a folder: its net, and city.json with what it was made from. Equal to the byte when made again.
+
+    Returns the city with the hash of its net. Raises MapError when the folder holds something else already.
+    """
+    known = {NET_NAME, ABOUT_NAME}
+    try:
+        if folder.exists() and not {path.name for path in folder.iterdir()} <= known:
+            raise MapError(f"{folder}: is not a city's folder, and not empty: choose a new one")
+        net = folder / NET_NAME
+        build_city(city, net)
+        made = City(seed=city.seed, size_m=city.size_m, style=city.style, net_hash=net_content_hash(net))
+        about = {"city": made, "generator": GENERATOR, "versions": {name: version(name) for name in MADE_WITH}}
+        (folder / ABOUT_NAME).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2) + b"\n")
+    except OSError as error:
+        raise MapError(f"{folder}: cannot be written: {error.strerror}") from error
+    return made
+
+
 def build_city(city: City, path: Path) -> None:
     """Build a city's net at `path`, in one move: several processes may build the same city at once."""
     plan = plan_city(city.seed, city.size_m, city.style)
@@ -61,7 +102,8 @@ def build_city(city: City, path: Path) -> None:
         with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:
             built = _build(plan, Path(folder))
             finished = Path(folder) / path.name
-            finished.write_bytes(with_programs(without_comments(built.read_bytes()), plan.signal_rng))
+            body = with_programs(without_comments(built.read_bytes()), plan.signal_rng)
+            finished.write_bytes(body + SEAL + _seal(body))
             finished.replace(path)
     except OSError as error:
         raise MapError(f"{path}: cannot be written: {error.strerror}; set COSIM_CACHE to another folder") from error
