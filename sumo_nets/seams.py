@@ -59,10 +59,13 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     hulls = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
     wedges = shapely.buffer(shapely.difference(hulls, corners), WELD_M, join_style="mitre")
     out: Polygons = polygons.copy()
-    out[wanted] = [_largest(shape) for shape in shapely.union(polygons, wedges)[wanted]]
+    grown = shapely.union(polygons, wedges)
+    out[wanted] = [_holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)]
     return out
 
 
-def _largest(shape: Polygon | MultiPolygon) -> Polygon:
-    """The largest part of a shape: slivers of a wedge on the far side of a corner are nothing."""
-    return shape if isinstance(shape, Polygon) else max(shape.geoms, key=lambda part: part.area)
+def _holding(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
+    """The part of a shape that holds a strip: slivers of a wedge on the far side of a corner are nothing."""
+    if isinstance(shape, Polygon):
+        return shape
+    return max(shape.geoms, key=lambda part: float(part.intersection(strip).area))
