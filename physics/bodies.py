@@ -14,7 +14,8 @@ from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M, RobotState
 from physics.buildings import Building
 from physics.furniture import Prop, solids_of
-from physics.mesh import as_lists, join
+from physics.materials import friction
+from physics.mesh import Mesh, as_lists, join
 from physics.robots import RobotModel
 from physics.tiles import CURB_M, Tile
 
@@ -22,7 +23,6 @@ PERSON_M: Final = 1.7
 VEHICLE_M: Final = 1.5
 FAR_BELOW_M: Final = -50.0
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
-_GROUND_FRICTION: Final = 0.9
 _TYRE: Final = {
     "lateralFriction": 1.0,
     "anisotropicFriction": (1.0, 0.3, 1.0),
@@ -76,15 +76,21 @@ class Bodies:
     ) -> list[int]:
         """The ground of a tile, its buildings, and its props with the heights of their feet in metres; returns what
         `remove` takes."""
-        mesh = join(list(tile.parts.values()))
+        of_friction: dict[float, list[Mesh]] = {}
+        for name, mesh in tile.parts.items():
+            of_friction.setdefault(friction(name), []).append(mesh)
+        ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
+        things = [self._add_building(b) for b in buildings] + [self._add_prop(prop, z) for prop, z in props]
+        return [*ground, *things]
+
+    def _add_ground(self, mesh: Mesh, value: float) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
         flags = p.GEOM_FORCE_CONCAVE_TRIMESH
         with as_lists(mesh.triangles, mesh.vertices - middle) as (indices, (vertices,)):
             shape = self._do("createCollisionShape", p.GEOM_MESH, vertices=vertices, indices=indices, flags=flags)
         ground = self._body(shape, middle)
-        self._do("changeDynamics", ground, -1, lateralFriction=_GROUND_FRICTION)
-        things = [self._add_building(b) for b in buildings] + [self._add_prop(prop, z) for prop, z in props]
-        return [ground, *things]
+        self._do("changeDynamics", ground, -1, lateralFriction=value)
+        return ground
 
     def _add_building(self, building: Building) -> int:
         half = [0.5 * s for s in building.size_m]

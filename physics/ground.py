@@ -13,6 +13,7 @@ from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, Frontage
 from physics.furniture import Prop
+from physics.materials import Paving
 from physics.placement import Placement
 from physics.robots import RobotModel
 from physics.tiles import Key, Tile, build_tile, key_at
@@ -27,12 +28,13 @@ class Ground:
         self.street_map = street_map
         self.seed = seed
         self._frontage = Frontage(street_map, seed)
+        self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
 
     def tile(self, key: Key) -> Tile:
         if key not in self._tiles:
-            self._tiles[key] = build_tile(self.street_map, key)
+            self._tiles[key] = build_tile(self.street_map, key, self._paving)
             if len(self._tiles) > _KEPT:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)

@@ -20,7 +20,7 @@ from cosim.geometry import Floats, Polyline
 from cosim.streetmap import Lane, PieceKind, StreetMap, Strip
 from physics.buildings import Frontage
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Kind, Prop, Zone, footprints
-from physics.tiles import CURBSTONE_M, RAMP_M, Key, key_at, square
+from physics.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
 
 CLEAR_HALF_M: Final = 0.6
 """The least half width of the band that is kept free along the middle of a sidewalk."""
@@ -34,7 +34,6 @@ GAP_M: Final = 0.25
 _EDGE_M: Final = 0.6
 """The outer edge of a wide sidewalk that props at the curb may use."""
 
-_DRIVEWAY_M: Final = 3.0
 _MARGIN_M: Final = 0.06
 _VERGE_MIN_M: Final = 0.3
 _ZONE_MAX_M: Final = 6.0
@@ -121,7 +120,7 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
         return
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0x9209])
     style = street_style(strip.street_class)
-    driveways = [s if strip.road_side <= 0 else line.length_m - s for s in getattr(strip, "driveways", ())]
+    driveways = [s if strip.road_side <= 0 else line.length_m - s for s in strip.driveways]
     busy = float(rng.uniform(0.5, 1.5))
     n = 0
     for kind in CATALOGUE:
@@ -275,7 +274,7 @@ def _meets(ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m
 
 def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
     """Whether something stands on a driveway or on the ramp to it."""
-    return abs(at_m - driveway_m) < 0.5 * (_DRIVEWAY_M + length_m) + RAMP_M
+    return abs(at_m - driveway_m) < 0.5 * (DRIVEWAY_M + length_m) + RAMP_M
 
 
 def _room(band: _Band) -> float:

@@ -22,7 +22,7 @@ from physics.canvas import Canvas, Colour, Rigs
 from physics.furniture import KINDS, Prop, parts_of
 from physics.ground import Ground
 from physics.robots import RobotModel
-from physics.tiles import SURFACES, Key, distance_to, key_at, keys_within, square
+from physics.tiles import Key, distance_to, key_at, keys_within, square, surface
 
 VISIBLE_M: Final = 50.0
 _FORGET_M: Final = 70.0
@@ -120,7 +120,7 @@ class Scene:
     def _built(self, key: Key) -> _TileBodies:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
-        parts = [(mesh, SURFACES[name][1], SURFACES[name][0]) for name, mesh in self._ground.tile(key).parts.items()]
+        parts = [(mesh, *surface(name)[::-1]) for name, mesh in self._ground.tile(key).parts.items()]
         for facade, mesh in facade_meshes(self._ground.buildings(key)).items():
             parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)

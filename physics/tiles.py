@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import PieceKind, StreetMap, Strip, union_closed
+from physics.materials import PAVINGS, Paving, cuts
 from physics.mesh import Mesh, quads
 
 TILE_M: Final = 48.0
@@ -49,6 +50,18 @@ SURFACES: Mapping[str, tuple[str, tuple[float, float, float]]] = {
 }
 """Kinds of ground: label of cosim.state.LABELS, and colour."""
 
+
+def surface(name: str) -> tuple[str, tuple[float, float, float]]:
+    """Label and colour of a part of a tile: a kind of ground, or one with a material of its own."""
+    label, colour = SURFACES[kind_of(name)]
+    return label, PAVINGS.get(name, colour)
+
+
+def kind_of(name: str) -> str:
+    """The kind of ground of a part of a tile."""
+    return name.partition(":")[0]
+
+
 _WALKED: Final[tuple[PieceKind, ...]] = ("strip", "corner")
 _LOW = ("road", "crossing", "stripe")
 
@@ -57,7 +70,7 @@ Key = tuple[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One square of ground. parts: kind of SURFACES -> mesh; low: road and crossings; crossings: all that ramps
+    """One square of ground. parts: name of `surface` -> mesh; low: road and crossings; crossings: all that ramps
     lead to, mouths of driveways included. Both reach RAMP_M and more beyond the square."""
 
     key: Key
@@ -95,16 +108,20 @@ def distance_to(key: Key, x_m: float, y_m: float) -> float:
     return math.hypot(max(x0 - x_m, x_m - x1, 0.0), max(y0 - y_m, y_m - y1, 0.0))
 
 
-def build_tile(street_map: StreetMap, key: Key) -> Tile:
-    """The ground of one tile; depends on nothing but the map around it."""
+def build_tile(street_map: StreetMap, key: Key, paving: Paving | None = None) -> Tile:
+    """The ground of one tile; depends on nothing but the map around it and the paving, None being plain."""
     border = shapely.box(*square(key))
     reach = shapely.box(*_grown(square(key), RAMP_M + 1.0))
     zones, stripes = _zones(street_map, reach)
     low = shapely.union_all([zones["road"], zones["crossing"]])
     shapely.prepare(low)
-    faces = _faces(border, zones, low, stripes)
-    kinds = _classify(faces, zones, stripes, low)
-    parts = _triangulate(faces, kinds, zones["ramp_to"])
+    pieces = paving.pieces(reach) if paving else []
+    faces = _faces(border, zones, low, stripes, cuts(pieces))
+    points = shapely.get_coordinates(shapely.point_on_surface(faces))
+    names = _classify(points, zones, stripes)
+    if paving:
+        names = paving.refined(names, points, pieces, reach)
+    parts = _triangulate(faces, names, zones["ramp_to"])
     return Tile(key, parts, low, zones["ramp_to"])
 
 
@@ -188,28 +205,29 @@ def _stripes(crossing: Strip) -> shapely.Geometry:
 
 
 def _faces(
-    border: shapely.Polygon, zones: Mapping[str, shapely.Geometry], low: shapely.Geometry, stripes: shapely.Geometry
+    border: shapely.Polygon,
+    zones: Mapping[str, shapely.Geometry],
+    low: shapely.Geometry,
+    stripes: shapely.Geometry,
+    ends: NDArray[np.object_],
 ) -> NDArray[np.object_]:
-    """The faces of the arrangement of all outlines within `border`."""
+    """The faces of the arrangement of all outlines within `border`; ends: lines that divide them further."""
     contours = [shapely.buffer(zones["ramp_to"], share * RAMP_M, quad_segs=3) for share in (0.5, 1.0)]
     curbstone = shapely.buffer(zones["road"], CURBSTONE_M, join_style="mitre", mitre_limit=2.0)
     on_high = shapely.difference(shapely.boundary(np.array([*contours, curbstone], dtype=object)), low)
     outlines = shapely.boundary(
         np.array([*(zones[k] for k in ("pavement", "crossing", "road", "verge", "apron")), stripes])
     )
-    inside = shapely.intersection(np.concatenate([on_high, outlines]), border)
+    inside = shapely.intersection(np.concatenate([on_high, outlines, ends]), border)
     lines = [part for part in shapely.get_parts(inside) if shapely.get_dimensions(part) == 1]
     noded = shapely.union_all([*lines, shapely.boundary(border)], grid_size=_GRID_M)
     return np.asarray(shapely.get_parts(shapely.polygonize(shapely.get_parts(noded))), dtype=object)
 
 
-def _classify(
-    faces: NDArray[np.object_], zones: Mapping[str, shapely.Geometry], stripes: shapely.Geometry, low: shapely.Geometry
-) -> list[str]:
-    """The kind of ground of each face, by a point in it."""
-    point = shapely.get_coordinates(shapely.point_on_surface(faces))
+def _classify(point: Floats, zones: Mapping[str, shapely.Geometry], stripes: shapely.Geometry) -> list[str]:
+    """The kind of ground at (N, 2) points."""
     x, y = point[:, 0], point[:, 1]
-    kind = np.full(len(faces), "ground", dtype=object)
+    kind = np.full(len(point), "ground", dtype=object)
     kind[shapely.contains_xy(zones["verge"], x, y)] = "verge"
     pavement = shapely.contains_xy(zones["pavement"], x, y)
     kind[pavement] = "sidewalk"
@@ -223,8 +241,8 @@ def _classify(
     return list(kind)
 
 
-def _triangulate(faces: NDArray[np.object_], kinds: Sequence[str], ramp_to: shapely.Geometry) -> dict[str, Mesh]:
-    """A mesh for each kind of ground, walls of the curbs included."""
+def _triangulate(faces: NDArray[np.object_], names: Sequence[str], ramp_to: shapely.Geometry) -> dict[str, Mesh]:
+    """A mesh for each surface, walls of the curbs included."""
     triangle, face = shapely.get_parts(shapely.constrained_delaunay_triangles(faces), return_index=True)
     corners = shapely.get_coordinates(triangle).reshape(-1, 4, 2)[:, :3]
     one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
@@ -234,10 +252,11 @@ def _triangulate(faces: NDArray[np.object_], kinds: Sequence[str], ramp_to: shap
     triangles = index.reshape(-1, 3)
     xy: Floats = grid.astype(float) * _GRID_M
     high = _raised(xy, ramp_to)
-    kind = np.asarray(kinds, dtype=object)[face]
-    is_low = np.isin(kind, _LOW)
-    parts = {name: _flat(xy, high * (name not in _LOW), triangles[kind == name]) for name in SURFACES}
-    walls = _walls(xy, high, triangles, is_low)
+    found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
+    surface_of = np.array([found.index(name) for name in names])[face]
+    lies_low = np.array([kind_of(name) in _LOW for name in found])
+    parts = {name: _flat(xy, high * ~lies_low[i], triangles[surface_of == i]) for i, name in enumerate(found)}
+    walls = _walls(xy, high, triangles, lies_low[surface_of])
     parts["curb"] = _append(parts["curb"], walls)
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
 

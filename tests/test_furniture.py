@@ -1,4 +1,4 @@
-"""Street furniture: the catalogue, where it stands, what stays free, and the engine's bodies and pictures of it."""
+"""Street furniture and paving: the catalogue, where it stands, what stays free; bodies and pictures of it."""
 
 from __future__ import annotations
 
@@ -21,8 +21,9 @@ from cosim.streetmap import StreetMap, Strip
 from physics.buildings import Frontage
 from physics.camera import BulletCamera
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
+from physics.materials import MATERIALS, PAVINGS, Paving, friction, street_of
 from physics.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, clear_width, street_style
-from physics.tiles import key_at, keys_within
+from physics.tiles import CURB_M, TILE_M, build_tile, key_at, keys_within, kind_of
 from physics.world import BulletWorld
 from sumo_nets.netfile import read_net
 from sumo_nets.store import city_net
@@ -218,3 +219,54 @@ def test_a_prop_is_seen_where_it_stands() -> None:
             assert frame.labels[rows.max() + 1, 48] in (LABELS["verge"], LABELS["ground"])
             nearest = 3.0 - 0.5 * prop.size_m[1] - frame.depth[rows, 48].min()
             assert 0.0 < nearest < 0.5
+
+
+def test_names_of_edges_give_their_street() -> None:
+    """Both directions and all pieces of a street are one street."""
+    assert {street_of(edge) for edge in ("s12", "-s12", "-s12a", "s12b")} == {"s12"}
+    assert {street_of(edge) for edge in ("-27#3", "27#-1", "27")} == {"27"}
+    assert street_of("gneE1") != street_of("gneE2")
+
+
+def test_streets_differ_by_their_paving() -> None:
+    """The paving of a street is the same for both sides and each time, differs by seed, and every class has several."""
+    strips = [
+        dataclasses.replace(MAP.strips["nw"], id=f"{sign}s{i}", street_class=name)
+        for name in ("residential", "commercial", "narrow")
+        for i in range(20)
+        for sign in ("", "-")
+    ]
+    one, two, other = (Paving(MAP, seed) for seed in (1, 1, 2))
+    surfaces = [one.surface(strip) for strip in strips]
+    assert surfaces == [two.surface(strip) for strip in strips]
+    assert surfaces != [other.surface(strip) for strip in strips]
+    assert surfaces[::2] == surfaces[1::2]
+    assert {name.split(":")[1] for name in surfaces} == set(MATERIALS) - {"grass"}
+    assert all(name in PAVINGS for name in surfaces)
+    assert friction("sidewalk:brick:0") < friction("sidewalk") < friction("sidewalk:asphalt:1")
+    assert friction("verge") == friction("verge:grass:1") == MATERIALS["grass"].friction
+
+
+def test_paved_ground_has_the_shape_of_plain_ground() -> None:
+    """A paved tile covers its square once, at the same heights, kind by kind the same areas; corners stay plain."""
+    paving = Paving(MAP, 1)
+    for key in keys_within(0.0, 0.0, 40.0):
+        plain, paved = build_tile(MAP, key), build_tile(MAP, key, paving)
+        areas: dict[str, list[float]] = {}
+        for side, tile in enumerate((plain, paved)):
+            for name, mesh in tile.parts.items():
+                corners = mesh.vertices[mesh.triangles]
+                one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+                area = 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
+                areas.setdefault(kind_of(name), [0.0, 0.0])[side] += area
+                low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
+                assert low >= 0.0 and high <= CURB_M + 1e-9
+        assert all(one == pytest.approx(two, abs=1e-3) for one, two in areas.values())
+        assert sum(two for _, two in areas.values()) == pytest.approx(TILE_M**2, abs=1e-6)
+        for name in set(paved.parts) - set(plain.parts):
+            mesh = paved.parts[name]
+            middles = mesh.vertices[mesh.triangles].mean(axis=1)
+            strips = [s for s in sidewalks(MAP) if paving.surface(s) == name]
+            lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
+            where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
+            assert shapely.contains_xy(shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]).all()
