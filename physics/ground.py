@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cosim.errors import UsageError
 from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, Frontage
@@ -22,11 +23,17 @@ _KEPT: Final = 100
 
 
 class Ground:
-    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are forgotten."""
+    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are forgotten.
 
-    def __init__(self, street_map: StreetMap, seed: int) -> None:
+    roughness: of the ground, from 0 (flat) to 1.
+    """
+
+    def __init__(self, street_map: StreetMap, seed: int, roughness: float = 0.0) -> None:
+        if not 0.0 <= roughness <= 1.0:
+            raise UsageError(f"roughness is {roughness:g}, but it lies between 0 (flat) and 1")
         self.street_map = street_map
         self.seed = seed
+        self.roughness = roughness
         self._frontage = Frontage(street_map, seed)
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage)
@@ -34,7 +41,8 @@ class Ground:
 
     def tile(self, key: Key) -> Tile:
         if key not in self._tiles:
-            self._tiles[key] = build_tile(self.street_map, key, self._paving)
+            roots = self._trees(key) if self.roughness > 0.0 else []
+            self._tiles[key] = build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
             if len(self._tiles) > _KEPT:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)
@@ -49,6 +57,12 @@ class Ground:
         props = self._placement.in_tile(key)
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         return tuple(zip(props, heights.tolist(), strict=True))
+
+    def _trees(self, key: Key) -> list[tuple[float, float]]:
+        """Where trees stand in a tile and around it."""
+        around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        props = [prop for near in around for prop in self._placement.in_tile(near) if prop.kind == "tree"]
+        return [(prop.x_m, prop.y_m) for prop in props]
 
     def heights(self, xy: ArrayLike) -> Floats:
         """Height of the ground at (N, 2) points, (N,) metres."""

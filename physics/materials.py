@@ -112,17 +112,19 @@ class Paving:
     ) -> list[str]:
         """Kinds of ground at (N, 2) points as names of surfaces."""
         names = np.asarray(kinds, dtype=object)
-        at = shapely.points(points)
+        at = np.asarray(shapely.points(points), dtype=object)
         in_corner = np.zeros(len(names), dtype=bool)
         corners = [corner.polygon for corner in self._map.near("corner", area)]
         if corners:
             in_corner[shapely.STRtree(corners).query(at, predicate="intersects")[0]] = True
-        if pieces:
-            point, piece = shapely.STRtree([p.polygon for p in pieces]).query(at, predicate="intersects")
-            surfaces = [self.surface(p) for p in pieces]
-            for i, k in zip(point.tolist(), piece.tolist(), strict=True):
-                if kinds[i] == pieces[k].kind and not in_corner[i]:
-                    names[i] = surfaces[k]
+        for kind in _PAVED:
+            own = [piece for piece in pieces if piece.kind == kind]
+            rows = np.flatnonzero((names == kind) & ~in_corner)
+            if own and len(rows):
+                tree = shapely.STRtree([piece.polygon for piece in own])
+                # Lanes of a road leave gaps between them: the nearest one counts.
+                row, piece = tree.query_nearest(at[rows], max_distance=_OVERLAP_M, all_matches=False)
+                names[rows[row]] = [self.surface(own[k]) for k in piece.tolist()]
         return list(names)
 
 

@@ -23,6 +23,7 @@ from cosim.geometry import Floats, Polyline
 from cosim.streetmap import PieceKind, StreetMap, Strip, union_closed
 from physics.materials import PAVINGS, Paving, cuts
 from physics.mesh import Mesh, quads
+from physics.relief import Relief, potholes
 
 TILE_M: Final = 48.0
 CURB_M: Final = 0.12
@@ -77,11 +78,13 @@ class Tile:
     parts: Mapping[str, Mesh]
     low: shapely.Geometry
     crossings: shapely.Geometry
+    relief: Relief | None = None
 
     def height(self, xy: ArrayLike) -> Floats:
         """Height of the ground at (N, 2) points in the square, (N,) metres."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
-        return np.where(shapely.contains_xy(self.low, xy[:, 0], xy[:, 1]), 0.0, _raised(xy, self.crossings))
+        low, high = _heights(xy, self.crossings, self.relief)
+        return np.where(shapely.contains_xy(self.low, xy[:, 0], xy[:, 1]), low, high)
 
 
 def key_at(x_m: float, y_m: float) -> Key:
@@ -108,21 +111,36 @@ def distance_to(key: Key, x_m: float, y_m: float) -> float:
     return math.hypot(max(x0 - x_m, x_m - x1, 0.0), max(y0 - y_m, y_m - y1, 0.0))
 
 
-def build_tile(street_map: StreetMap, key: Key, paving: Paving | None = None) -> Tile:
-    """The ground of one tile; depends on nothing but the map around it and the paving, None being plain."""
+def build_tile(
+    street_map: StreetMap,
+    key: Key,
+    paving: Paving | None = None,
+    roughness: float = 0.0,
+    seed: int = 0,
+    roots: ArrayLike = (),
+) -> Tile:
+    """The ground of one tile; depends on nothing but the map around it and the paving, None being plain.
+
+    roughness: 0 (flat) to 1; seed: of the unevenness; roots: (N, 2) trees in and around the tile.
+    """
     border = shapely.box(*square(key))
     reach = shapely.box(*_grown(square(key), RAMP_M + 1.0))
     zones, stripes = _zones(street_map, reach)
     low = shapely.union_all([zones["road"], zones["crossing"]])
     shapely.prepare(low)
     pieces = paving.pieces(reach) if paving else []
-    faces = _faces(border, zones, low, stripes, cuts(pieces))
+    ends, relief = cuts(pieces), None
+    if roughness > 0.0:
+        holes = potholes(zones["road"], square(key), roughness, seed)
+        relief = Relief(roughness, seed, np.asarray(roots, dtype=float).reshape(-1, 2), holes)
+        ends = np.concatenate([ends, relief.lines(zones["pavement"], square(key))])
+    faces = _faces(border, zones, low, stripes, ends)
     points = shapely.get_coordinates(shapely.point_on_surface(faces))
     names = _classify(points, zones, stripes)
     if paving:
         names = paving.refined(names, points, pieces, reach)
-    parts = _triangulate(faces, names, zones["ramp_to"])
-    return Tile(key, parts, low, zones["ramp_to"])
+    parts = _triangulate(faces, names, zones["ramp_to"], relief)
+    return Tile(key, parts, low, zones["ramp_to"], relief)
 
 
 def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, shapely.Geometry], shapely.Geometry]:
@@ -241,7 +259,9 @@ def _classify(point: Floats, zones: Mapping[str, shapely.Geometry], stripes: sha
     return list(kind)
 
 
-def _triangulate(faces: NDArray[np.object_], names: Sequence[str], ramp_to: shapely.Geometry) -> dict[str, Mesh]:
+def _triangulate(
+    faces: NDArray[np.object_], names: Sequence[str], ramp_to: shapely.Geometry, relief: Relief | None
+) -> dict[str, Mesh]:
     """A mesh for each surface, walls of the curbs included."""
     triangle, face = shapely.get_parts(shapely.constrained_delaunay_triangles(faces), return_index=True)
     corners = shapely.get_coordinates(triangle).reshape(-1, 4, 2)[:, :3]
@@ -251,11 +271,14 @@ def _triangulate(faces: NDArray[np.object_], names: Sequence[str], ramp_to: shap
     grid, index = np.unique(np.rint(corners.reshape(-1, 2) / _GRID_M).astype(np.int64), axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     xy: Floats = grid.astype(float) * _GRID_M
-    high = _raised(xy, ramp_to)
+    low, high = _heights(xy, ramp_to, relief)
     found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
     surface_of = np.array([found.index(name) for name in names])[face]
     lies_low = np.array([kind_of(name) in _LOW for name in found])
-    parts = {name: _flat(xy, high * ~lies_low[i], triangles[surface_of == i]) for i, name in enumerate(found)}
+    parts = {
+        name: _flat(xy, low if lies_low[i] else high, triangles[surface_of == i], relief is not None)
+        for i, name in enumerate(found)
+    }
     walls = _walls(xy, high, triangles, lies_low[surface_of])
     parts["curb"] = _append(parts["curb"], walls)
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
@@ -278,11 +301,22 @@ def _walls(xy: Floats, high: Floats, triangles: NDArray[np.int64], is_low: NDArr
     return Mesh(walls.vertices, walls.normals, walls.triangles[real])
 
 
-def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64]) -> Mesh:
+def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = False) -> Mesh:
     used, index = np.unique(triangles, return_inverse=True)
+    corners = index.reshape(-1, 3).astype(np.int32)
     vertices = np.column_stack([xy[used], z[used]])
     normals = np.tile([0.0, 0.0, 1.0], (len(used), 1))
-    return Mesh(vertices, normals, index.reshape(-1, 3).astype(np.int32))
+    return Mesh(vertices, _normals(vertices, corners) if shaded else normals, corners)
+
+
+def _normals(vertices: Floats, triangles: NDArray[np.int32]) -> Floats:
+    """Upward normals of vertices: of the triangles around each, by their areas."""
+    one, two = (vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))
+    face = np.repeat(np.cross(one, two), 3, axis=0)
+    normals = np.zeros_like(vertices)
+    np.add.at(normals, triangles.ravel(), face)
+    normals[:, 2] = np.maximum(normals[:, 2], 1e-9)
+    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def _append(a: Mesh, b: Mesh) -> Mesh:
@@ -291,6 +325,14 @@ def _append(a: Mesh, b: Mesh) -> Mesh:
         np.concatenate([a.normals, b.normals]),
         np.concatenate([a.triangles, b.triangles + len(a.vertices)]).astype(np.int32),
     )
+
+
+def _heights(xy: Floats, ramp_to: shapely.Geometry, relief: Relief | None) -> tuple[Floats, Floats]:
+    """Heights of road and of high ground at (N, 2) points; the unevenness of pavement ends at the ramps."""
+    high = _raised(xy, ramp_to)
+    if relief is None:
+        return np.zeros(len(xy)), high
+    return relief.on_road(xy), high + relief.on_pavement(xy) * high / CURB_M
 
 
 def _raised(xy: Floats, ramp_to: shapely.Geometry) -> Floats:

@@ -36,13 +36,18 @@ Kind = Literal["pedestrian", "vehicle", "wall", "object"]
 class BulletWorld:
     """The physics of one episode. Use it in a `with` block; one PyBullet client each, so several may live at once.
 
-    barriers: fences that stand for the whole episode.
+    barriers: fences that stand for the whole episode. roughness: of the ground, from 0 (flat) to 1.
     """
 
     def __init__(
-        self, street_map: StreetMap, seed: int, barriers: Sequence[Barrier] = (), robot: str = "courier"
+        self,
+        street_map: StreetMap,
+        seed: int,
+        barriers: Sequence[Barrier] = (),
+        robot: str = "courier",
+        roughness: float = 0.0,
     ) -> None:
-        self.ground = Ground(street_map, seed)
+        self.ground = Ground(street_map, seed, roughness)
         self.model = robot_model(robot)
         self.barriers = tuple(barriers)
         self._drive = SkidDrive(self.model)

@@ -1,4 +1,4 @@
-"""Street furniture and paving: the catalogue, where it stands, what stays free; bodies and pictures of it."""
+"""Street furniture, paving and relief: what stands where, what stays free, what the ground is like."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import shapely
 
+from cosim.errors import UsageError
 from cosim.geometry import Polyline, Pose
 from cosim.ports import CameraSpec
 from cosim.scenario import City
@@ -23,7 +24,7 @@ from physics.camera import BulletCamera
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
 from physics.materials import MATERIALS, PAVINGS, Paving, friction, street_of
 from physics.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, clear_width, street_style
-from physics.tiles import CURB_M, TILE_M, build_tile, key_at, keys_within, kind_of
+from physics.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.world import BulletWorld
 from sumo_nets.netfile import read_net
 from sumo_nets.store import city_net
@@ -270,3 +271,61 @@ def test_paved_ground_has_the_shape_of_plain_ground() -> None:
             lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
             where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
             assert shapely.contains_xy(shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]).all()
+
+
+def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
+    """Heights of a tile's own triangles at points on high ground, from the mesh."""
+    found = np.full(len(xy), np.nan)
+    for name in tile.parts:
+        mesh = tile.parts[name]
+        corners = mesh.vertices[mesh.triangles]
+        tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
+        point, triangle = tree.query(shapely.points(xy), predicate="within")
+        for i, k in zip(point.tolist(), triangle.tolist(), strict=True):
+            a, b, c = corners[k]
+            normal = np.cross(b - a, c - a)
+            found[i] = a[2] - ((xy[i] - a[:2]) @ normal[:2]) / normal[2]
+    return found
+
+
+def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> None:
+    """At 0 nothing changes; above it the mesh follows `height`, tiles meet, ramps stay, roads get potholes."""
+    key = (0, 0)
+    flat, zero = build_tile(MAP, key), build_tile(MAP, key, roughness=0.0, seed=9, roots=[(10.0, 5.0)])
+    assert all(np.array_equal(mesh.vertices, zero.parts[name].vertices) for name, mesh in flat.parts.items())
+    rough = build_tile(MAP, key, roughness=1.0, seed=9, roots=[(10.0, 5.0)])
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(5.0, 45.0, 400), rng.uniform(3.8, 6.3, 400)])
+    there = rough_height(rough, points)
+    known = np.isfinite(there)
+    assert known.mean() > 0.95
+    assert np.abs(there - rough.height(points))[known].max() < 0.012
+    assert np.ptp(there[known]) > 0.03 and np.abs(there[known] - CURB_M).max() < 0.1
+    assert rough.height([[10.0, 5.0]])[0] > build_tile(MAP, key, roughness=1.0, seed=9).height([[10.0, 5.0]])[0] + 0.02
+    other = build_tile(MAP, (-1, 0), roughness=1.0, seed=9)
+    border = np.column_stack([np.full(50, 0.4137), np.linspace(1.0, 20.0, 50)])
+    assert np.allclose(rough.height(border), other.height(border), atol=1e-9)
+    ramp = np.array([[0.5, 3.5 + d] for d in (0.001, 0.01)])
+    assert np.allclose(rough.height(ramp), flat.height(ramp), atol=1e-3)
+    tiles = [build_tile(MAP, (i, j), roughness=1.0, seed=9) for i in (-1, 0) for j in (-1, 0)]
+    road = np.concatenate([tile.parts["road"].vertices[:, 2] for tile in tiles])
+    assert road.min() == pytest.approx(-0.05, abs=1e-3) and road.max() == 0.0
+
+
+@pytest.mark.engine
+def test_the_robot_feels_rough_ground() -> None:
+    """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly tilts."""
+    tilts = {}
+    for roughness in (0.0, 1.0):
+        with BulletWorld(MAP, seed=3, roughness=roughness) as world:
+            world.place(Pose(8.0, 5.0, 0.0))
+            robots = [world.step(Command(1.0, 0.0), EMPTY, EMPTY, 10).robot for _ in range(300)]
+        assert robots[-1].pose.x_m > 20.0
+        tilts[roughness] = max(robot.tilt_rad for robot in robots)
+    assert tilts[0.0] < 0.01 < tilts[1.0] < 0.12
+
+
+def test_roughness_has_a_range() -> None:
+    """A roughness beyond 1 is refused with the range."""
+    with pytest.raises(UsageError, match=r"roughness is 1\.5, but it lies between 0 \(flat\) and 1"):
+        BulletWorld(MAP, seed=1, roughness=1.5)
