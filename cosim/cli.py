@@ -224,6 +224,13 @@ def bench(
         inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
         parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
     out.print(parts)
+    places = Table("2 km city", "median", "spread", "target")
+    places.add_row("seed to street map, s", *spread([p.made_s for p in report.places]), "<= 4")
+    places.add_row("cache to street map, s", *spread([p.read_s for p in report.places]), "<= 0.5")
+    places.add_row("point in walkable area, us", *spread([p.contains_us for p in report.places]), "<= 5")
+    places.add_row("distance to its edge, us", *spread([p.distance_us for p in report.places]), "<= 20")
+    places.add_row("shortest walk, ms", *spread([p.walk_ms for p in report.places]), "<= 2")
+    out.print(places)
 
 
 class Board:

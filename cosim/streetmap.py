@@ -191,8 +191,9 @@ class WalkableArea:
     def __init__(self, polygon: Polygon | MultiPolygon) -> None:
         self.polygon = polygon
         shapely.prepare(polygon)
-        self._edge = shapely.boundary(polygon)
-        shapely.prepare(self._edge)
+        rings = [shapely.get_coordinates(r) for part in shapely.get_parts(polygon) for r in shapely.get_rings(part)]
+        ends = np.concatenate([np.empty((0, 2, 2)), *(np.stack([r[:-1], r[1:]], axis=1) for r in rings)])
+        self._sides = shapely.STRtree(np.asarray(shapely.linestrings(ends), dtype=object))
 
     def contains(self, x_m: float, y_m: float) -> bool:
         return bool(shapely.contains_xy(self.polygon, x_m, y_m))
@@ -201,5 +202,7 @@ class WalkableArea:
         """Distance of (N, 2) points to the edge of the area in metres, positive inside."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
         inside: NDArray[np.bool_] = shapely.contains_xy(self.polygon, xy[:, 0], xy[:, 1])
-        gap = np.asarray(shapely.distance(shapely.points(xy), self._edge), dtype=float)
+        if not len(self._sides):
+            return np.full(len(xy), -np.inf)
+        _, gap = self._sides.query_nearest(shapely.points(xy), return_distance=True, all_matches=False)
         return np.where(inside, gap, -gap)

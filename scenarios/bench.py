@@ -11,9 +11,11 @@ import multiprocessing
 import os
 import resource
 import statistics
+import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -24,6 +26,8 @@ from cosim.step import Reset, Step
 
 MEASURED_S = 60.0
 WARM_UP_S = 5.0
+ASKED = 500
+"""Questions about a place whose mean time is taken."""
 PARTS = ("crowd", "physics", "camera", "policy", "bridge", "referee", "loop")
 
 
@@ -149,12 +153,63 @@ def first_frame(size_m: float) -> float:
         return time.perf_counter() - began
 
 
+class Places(NamedTuple):
+    """How fast places are. made_s: a city from its seed, read_s: from the cache, both to a StreetMap; contains_us,
+    distance_us: a point against the walkable area of the whole city; walk_ms: a shortest walk."""
+
+    made_s: float
+    read_s: float
+    contains_us: float
+    distance_us: float
+    walk_ms: float
+
+
+def places(size_m: float) -> Places:
+    """Make a city of a size from its seed, read it again, ask it."""
+    import numpy as np
+
+    from cosim.streetmap import WalkableArea
+    from cosim.walks import WalkGraph
+    from sumo_nets.netfile import read_net
+    from sumo_nets.store import build_city, city_net
+
+    city = City(seed=5, size_m=size_m)
+    with tempfile.TemporaryDirectory() as folder:
+        began = time.perf_counter()
+        path = Path(folder) / "city.net.xml"
+        build_city(city, path)
+        read_net(path)
+        made_s = time.perf_counter() - began
+    city_net(city)
+    began = time.perf_counter()
+    street_map = read_net(city_net(city))
+    read_s = time.perf_counter() - began
+    graph, area = WalkGraph(street_map), WalkableArea(street_map.walkable)
+    rng = np.random.default_rng(1)
+    ends = rng.integers(len(graph.ports), size=(ASKED, 2)).tolist()
+    points = graph.xy[rng.integers(len(graph.xy), size=ASKED)] + rng.normal(0.0, 2.0, (ASKED, 2))
+    graph.shortest(graph.ports[0], graph.ports[-1])
+    area.contains(*points[0])
+    stamps = [time.perf_counter()]
+    for x, y in points.tolist():
+        area.contains(x, y)
+    stamps.append(time.perf_counter())
+    area.signed_distance(points)
+    stamps.append(time.perf_counter())
+    for a, b in ends:
+        graph.shortest(graph.ports[a], graph.ports[b])
+    stamps.append(time.perf_counter())
+    each = [(b - a) / ASKED for a, b in pairwise(stamps)]
+    return Places(made_s, read_s, 1e6 * each[0], 1e6 * each[1], 1e3 * each[2])
+
+
 class Report(NamedTuple):
     """Every figure, one value per round. small: the same drive in a city of a sixteenth of the area."""
 
     big: list[Drive]
     small: list[Drive]
     first_frame_s: list[float]
+    places: list[Places]
 
     def growth(self) -> list[float]:
         """Cost of a simulated second in the 2 km city over that in the 0.5 km city, round by round."""
@@ -163,12 +218,13 @@ class Report(NamedTuple):
 
 def measure(rounds: int, tell: Callable[[str], None]) -> Report:
     """Take every figure `rounds` times, each in a fresh process."""
-    report = Report([], [], [])
+    report = Report([], [], [], [])
     for i in range(rounds):
         tell(f"round {i + 1} of {rounds}")
         report.big.append(alone(drive, 2000.0))
         report.small.append(alone(drive, 500.0))
         report.first_frame_s.append(alone(first_frame, 2000.0))
+        report.places.append(alone(places, 2000.0))
     return report
 
 

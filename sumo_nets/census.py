@@ -125,8 +125,8 @@ def census(path: Path, street_map: StreetMap | None = None) -> Census:
 
 
 def clear_width_m(place: StreetMap, widest_m: float = 2.0, step_m: float = 0.05) -> float:
-    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable ground is still one
-    piece that holds the middle of every strip."""
+    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable ground still has one
+    piece that holds the middles of all strips."""
     ground = shapely.simplify(place.walkable, 0.01)
     lines = shapely.linestrings(
         np.concatenate([strip.line[:, :2] for strip in place.strips.values()]),
@@ -141,9 +141,11 @@ def clear_width_m(place: StreetMap, widest_m: float = 2.0, step_m: float = 0.05)
 
 
 def _passes(ground: shapely.Geometry, middles: Floats, half_m: float) -> bool:
-    free = shapely.buffer(ground, -half_m, quad_segs=4)
-    if shapely.get_num_geometries(free) != 1:
+    parts = shapely.get_parts(shapely.buffer(ground, -half_m, quad_segs=4))
+    if not len(parts):
         return False
+    # A niche at a corner may come off; what matters is that every strip can be reached.
+    free = parts[np.argmax(shapely.area(parts))]
     shapely.prepare(free)
     return bool(shapely.contains_xy(free, middles[:, 0], middles[:, 1]).all())
 

@@ -32,8 +32,10 @@ def coordinates(shapes: Sequence[str]) -> tuple[Floats, list[int]]:
     if not all(counts):
         raise ValueError("a shape without points")
     every = [point for row in points for point in row]
-    # Points with and without elevation mix, even in one shape.
-    numbers = ",".join(p if p.count(",") == 1 else ",".join(p.split(",")[:2]) for p in every).split(",")
+    if {p.count(",") for p in every} - {1}:
+        # Points with and without elevation mix, even in one shape.
+        every = [",".join(p.split(",")[:2]) for p in every]
+    numbers = ",".join(every).split(",")
     flat = np.fromiter(map(float, numbers), dtype=float, count=len(numbers)) if numbers != [""] else np.empty(0)
     if len(flat) != 2 * len(every) or not np.isfinite(flat).all():
         raise ValueError("a shape with points that are not x,y")

@@ -8,6 +8,7 @@ around the line leaves a gap on one side that is nothing but an artefact, and th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import shapely
@@ -35,11 +36,17 @@ def close_seams(
     if not len(polygons):
         return []
     grown = np.array(polygons, dtype=object)
-    for side, (end, inner) in enumerate(((0, 1), (-1, -2))):
-        at = np.array([line[end, :2] for line in lines])
-        before = np.array([line[inner, :2] for line in lines])
-        grown = joined(grown, at, before, widths_m, np.array([pair[side] for pair in corners], dtype=object))
-    return list(grown)
+    met = [np.array([pair[side] for pair in corners], dtype=object) for side in (0, 1)]
+    at = [np.array([line[i, :2] for line in lines]) for i in (0, 1, -1, -2)]
+
+    def both_ends(rows: slice) -> Polygons:
+        one = joined(grown[rows], at[0][rows], at[1][rows], widths_m[rows], met[0][rows])
+        return joined(one, at[2][rows], at[3][rows], widths_m[rows], met[1][rows])
+
+    # Strips do not depend on each other, and shapely works outside of Python's lock.
+    half = len(grown) // 2
+    with ThreadPoolExecutor(2) as threads:
+        return [p for part in threads.map(both_ends, (slice(0, half), slice(half, None))) for p in part]
 
 
 def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, corners: Polygons) -> Polygons:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -16,6 +17,7 @@ from typer.testing import CliRunner
 from cosim.cli import app
 from cosim.errors import MapError
 from cosim.scenario import City
+from cosim.streetmap import WalkableArea
 from cosim.walks import WalkGraph
 from sumo_nets.census import BLOCKS, ZONES, _shape, census, clear_width_m, longest_walk_m
 from sumo_nets.city import STYLES
@@ -157,3 +159,14 @@ def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.png"), "--zoom", zoom])
         assert bad.exit_code != 0 and "--zoom" in str(bad.exception)
     assert runner.invoke(app, ["city", "make", "--seed", "1", "--size", "9", str(tmp_path / "e")]).exit_code != 0
+
+
+def test_distance_to_the_edge_is_the_one_of_geometry(large: Path) -> None:
+    """Signed distances equal shapely's distance to the whole boundary, positive inside, holes and parts included."""
+    place = read_net(large)
+    area = WalkableArea(place.walkable)
+    xy = np.random.default_rng(1).uniform(0.0, 2000.0, (300, 2))
+    points = shapely.points(xy)
+    expected = shapely.distance(points, shapely.boundary(place.walkable))
+    inside = shapely.contains(place.walkable, points)
+    assert np.array_equal(area.signed_distance(xy), np.where(inside, expected, -expected))
