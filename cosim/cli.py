@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from datetime import datetime
 from pathlib import Path
@@ -109,6 +110,7 @@ def run(
         if done:
             err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
         board = Board(len(picked), len(done), {s.id: s.route_line.length_m for s in picked})
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with board.bars:
                 run_all(held, todo, policy, manifest, jobs=jobs, tell=board.tell, frames_every_s=frames)

@@ -150,16 +150,18 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path,
     assert (desk / "three/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_an_interrupted_run_is_finished_by_resume(desk: Path, whole_run: Path, how: signal.Signals) -> None:
     """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table is the same."""
     out = desk / f"broken-{how.name}"
     command = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "straight", "--out", out.name]
-    run = subprocess.Popen(command, cwd=desk, stderr=subprocess.PIPE, text=True, env=environment())
+    run = subprocess.Popen(
+        command, cwd=desk, stderr=subprocess.PIPE, text=True, env=environment(), preexec_fn=hear_interrupts
+    )
     wait_for(lambda: (out / "episodes/t-0/record.json").exists())
     run.send_signal(how)
     said = run.communicate(timeout=30)[1]
-    if how == signal.SIGINT:
+    if how != signal.SIGKILL:
         assert run.returncode == 130
         assert f"--out {out.name} --resume" in said and "finished and kept" in said
     kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
@@ -186,6 +188,11 @@ def test_a_run_killed_at_its_start_leaves_no_false_crash(desk: Path, whole_run: 
     again = cosim("run", "tiny.json", "--policy", "straight", "--out", out.name, "--resume", cwd=desk)
     assert again.returncode == 0, again.stderr
     assert (out / "results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+def hear_interrupts() -> None:
+    """A shell's background jobs are started deaf to Ctrl-C; a user's run is not one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def children(pid: int) -> list[int]:
