@@ -64,7 +64,9 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     met = shapely.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
     hulls = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
-    wedges = shapely.buffer(shapely.difference(hulls, corners), WELD_M, join_style="mitre")
+    # Slivers without width make GEOS divide by zero; it copes.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        wedges = shapely.buffer(shapely.difference(hulls, corners), WELD_M, join_style="mitre")
     out: Polygons = polygons.copy()
     grown = shapely.union(polygons, wedges)
     out[wanted] = [_holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)]
