@@ -19,8 +19,11 @@ from numpy.typing import NDArray
 
 from cosim.errors import RunError
 from cosim.geometry import Floats
+from cosim.ports import Manifest
 from cosim.referee import Failure, Verdict
+from cosim.scenario import Scenario, content_hash
 from cosim.step import Step
+from cosim.versions import versions
 
 SCHEMA = 1
 
@@ -128,6 +131,23 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         if record.schema != SCHEMA:
             raise RunError(f"{path}: record schema {record.schema}; this version reads {SCHEMA}")
         return record
+
+
+def begun(scenario: Scenario, manifest: Manifest, suite_hash: str) -> Record:
+    """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
+    return Record(
+        scenario=scenario.id,
+        scenario_hash=content_hash(scenario),
+        suite=scenario.suite,
+        suite_hash=suite_hash,
+        seed=scenario.seed,
+        policy=manifest.name,
+        policy_version=manifest.version,
+        goal_protocol="route" if manifest.privileged else "none",
+        renderer="none",
+        versions=versions(),
+        status="crashed",
+    )
 
 
 class StateHash:

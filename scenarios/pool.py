@@ -17,12 +17,13 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
+import msgspec
+
 from cosim.errors import RunError
 from cosim.ports import Manifest
-from cosim.record import Record
+from cosim.record import begun
 from cosim.runfolder import RunFolder
-from cosim.scenario import Scenario, content_hash
-from cosim.versions import versions
+from cosim.scenario import Scenario
 from scenarios import worker
 from scenarios.messages import Done, Job, Message, Unsaved, decode_message, encode
 
@@ -146,20 +147,8 @@ class _Pool:
 
     def give_up(self, scenario: Scenario, reason: str) -> None:
         """Record a scenario that no worker survives as crashed."""
-        record = Record(
-            scenario=scenario.id,
-            scenario_hash=content_hash(scenario),
-            suite=scenario.suite,
-            suite_hash=self._folder.spec.suite_hash,
-            seed=scenario.seed,
-            policy=self._manifest.name,
-            policy_version=self._manifest.version,
-            goal_protocol="route" if self._manifest.privileged else "none",
-            renderer="none",
-            versions=versions(),
-            status="crashed",
-            reason=reason,
-        )
+        record = begun(scenario, self._manifest, self._folder.spec.suite_hash)
+        record = msgspec.structs.replace(record, reason=reason)
         target = self._folder.episode_folder(scenario.id)
         try:
             target.mkdir(parents=True, exist_ok=True)

@@ -15,11 +15,10 @@ from cosim.events import EventState
 from cosim.loop import steps
 from cosim.metrics import Episode, measure
 from cosim.ports import Policy
-from cosim.record import Log, Record, Recorder, TriggeredEvent
+from cosim.record import Log, Record, Recorder, TriggeredEvent, begun
 from cosim.referee import Failure, Referee, Verdict
-from cosim.scenario import Scenario, content_hash
+from cosim.scenario import Scenario
 from cosim.step import Step
-from cosim.versions import versions
 from scenarios.assemble import Stage, staged
 
 PASSED_M = 5.0
@@ -40,20 +39,7 @@ class Outcome:
 def episode(scenario: Scenario, policy: Policy, *, suite_hash: str = "", watch: Watch | None = None) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`."""
     began = time.perf_counter()
-    manifest = policy.manifest
-    record = Record(
-        scenario=scenario.id,
-        scenario_hash=content_hash(scenario),
-        suite=scenario.suite,
-        suite_hash=suite_hash,
-        seed=scenario.seed,
-        policy=manifest.name,
-        policy_version=manifest.version,
-        goal_protocol="route" if manifest.privileged else "none",
-        renderer="none",
-        versions=versions(),
-        status="crashed",
-    )
+    record = begun(scenario, policy.manifest, suite_hash)
     try:
         with staged(scenario, policy) as stage:
             record = replaced(record, renderer=stage.renderer)
