@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
-from cosim.errors import UsageError
+from cosim.box import box_of
 
 if TYPE_CHECKING:
     from cosim.report.above import Image
@@ -108,7 +108,7 @@ def draw(
     from sumo_nets.netfile import read_net
     from sumo_nets.store import city_net
 
-    part = (0.0, 0.0, size, size) if zoom is None else _box(zoom)
+    part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
     write_png(_picture(read_net(city_net(City(seed=seed, size_m=size, style=style))), part), picture)
     out.print(f"Picture: {picture}", soft_wrap=True)
 
@@ -152,13 +152,3 @@ def _picture(street_map: StreetMap, part: tuple[float, float, float, float]) -> 
     sheet = Sheet(part)
     draw_streets(sheet, street_map, shapely.box(*part))
     return sheet.image[:-LEGEND_PX]
-
-
-def _box(words: str) -> tuple[float, float, float, float]:
-    try:
-        x0, y0, x1, y1 = (float(word) for word in words.split(","))
-    except ValueError:
-        raise UsageError(f"--zoom takes four numbers with commas between them, not '{words}'") from None
-    if not (x0 < x1 and y0 < y1):
-        raise UsageError(f"--zoom is x0,y0,x1,y1: '{words}' is empty")
-    return x0, y0, x1, y1

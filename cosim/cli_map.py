@@ -11,6 +11,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from cosim.box import box_of
 from cosim.errors import MapError, UsageError
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ def import_(
     from sumo_nets.importer import Options
     from sumo_nets.mapstore import checked_map, import_map
 
-    options = Options(bbox=_box("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
+    options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
     with err.status(f"importing {file.name} ..."):
         about = import_map(file, name, options)
         _, check, about = checked_map(about.name)
@@ -69,7 +70,7 @@ def check(
     as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
 ) -> None:
     """Say what a map is, what is wrong with it and what it can be used for. Exit code 1: it is not usable."""
-    part = _box("--zoom", zoom)
+    part = None if zoom is None else box_of("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
     street_map, found, about = _look_up(place)
@@ -150,18 +151,6 @@ def _look_up(place: str) -> tuple[StreetMap, MapCheck, About | None]:
 
     street_map = read_net(path)
     return street_map, check_map(street_map, None, read_facts(path)), None
-
-
-def _box(option: str, words: str | None) -> tuple[float, float, float, float] | None:
-    if words is None:
-        return None
-    try:
-        x0, y0, x1, y1 = (float(word) for word in words.split(","))
-    except ValueError:
-        raise UsageError(f"{option} takes four numbers with commas between them, not '{words}'") from None
-    if not (x0 < x1 and y0 < y1):
-        raise UsageError(f"{option} is west,south,east,north: '{words}' is empty")
-    return x0, y0, x1, y1
 
 
 def _yes(possible: bool) -> str:

@@ -19,6 +19,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+import msgspec
+
 from cosim.policies.route import Route
 from cosim.ports import Camera, CameraSpec, Crowd, Director, Manifest, Policy, World
 from cosim.scenario import City, CrowdSpec, Scenario
@@ -84,8 +86,7 @@ def scenario_in(size_m: float) -> Scenario:
     city = City(seed=5, size_m=size_m)
     _, street_map = place(city)
     whole = build(city, street_map, WalkGraph(street_map), 7, "bench")
-    fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
-    return Scenario(**fields | {"crowd": CrowdSpec(persons=50, radius_m=80.0, vehicles=20)})
+    return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=50, radius_m=80.0, vehicles=20))
 
 
 def drive(size_m: float) -> Drive:

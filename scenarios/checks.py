@@ -8,6 +8,7 @@ from importlib.metadata import packages_distributions
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
 import numpy as np
 
 from cosim.errors import CosimError
@@ -77,8 +78,7 @@ def small_scenario() -> Scenario:
     """A long-horizon scenario in a small city with a small crowd."""
     _, street_map = place(SMALL)
     scenario = build(SMALL, street_map, WalkGraph(street_map), 0, "doctor")
-    fields = {name: getattr(scenario, name) for name in Scenario.__struct_fields__}
-    return Scenario(**fields | {"crowd": CrowdSpec(persons=10, radius_m=50.0, vehicles=4)})
+    return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=10, radius_m=50.0, vehicles=4))
 
 
 CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
