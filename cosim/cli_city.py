@@ -105,11 +105,11 @@ def draw(
     """Draw a city from above."""
     from cosim.report.mapsheet import write_png
     from cosim.scenario import City
-    from sumo_nets.netfile import read_net
+    from sumo_nets.atlas import street_map_of
     from sumo_nets.store import city_net
 
     part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
-    write_png(_picture(read_net(city_net(City(seed=seed, size_m=size, style=style))), part), picture)
+    write_png(_picture(street_map_of(city_net(City(seed=seed, size_m=size, style=style))), part), picture)
     out.print(f"Picture: {picture}", soft_wrap=True)
 
 

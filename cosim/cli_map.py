@@ -146,10 +146,10 @@ def _look_up(place: str) -> tuple[StreetMap, MapCheck, About | None]:
     if not path.name.endswith((".net.xml", ".net.xml.gz", "net.xml")):
         raise MapError(f"{path}: only SUMO nets can be checked as they are: import it first with `cosim map import`")
     from cosim.mapcheck import check_map
+    from sumo_nets.atlas import street_map_of
     from sumo_nets.netfacts import read_facts
-    from sumo_nets.netfile import read_net
 
-    street_map = read_net(path)
+    street_map = street_map_of(path)
     return street_map, check_map(street_map, None, read_facts(path)), None
 
 

@@ -25,9 +25,9 @@ from physics.camera import BulletCamera
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
+from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.mapstore import map_net
-from sumo_nets.netfile import read_net
 from sumo_nets.store import city_net
 
 CORRIDOR_M = 40.0
@@ -85,4 +85,4 @@ def directed(env: str) -> Iterator[Director]:
 def place(where: Place) -> tuple[Path, StreetMap]:
     """The net of a place and what was read from it; the last one is kept."""
     path = city_net(where) if isinstance(where, City) else map_net(where)
-    return path, read_net(path)
+    return path, street_map_of(path)

@@ -171,6 +171,7 @@ def places(size_m: float) -> Places:
 
     from cosim.streetmap import WalkableArea
     from cosim.walks import WalkGraph
+    from sumo_nets.atlas import street_map_of
     from sumo_nets.netfile import read_net
     from sumo_nets.store import build_city, city_net
 
@@ -181,9 +182,9 @@ def places(size_m: float) -> Places:
         build_city(city, path)
         read_net(path)
         made_s = time.perf_counter() - began
-    city_net(city)
+    street_map_of(city_net(city))
     began = time.perf_counter()
-    street_map = read_net(city_net(city))
+    street_map = street_map_of(city_net(city))
     read_s = time.perf_counter() - began
     graph, area = WalkGraph(street_map), WalkableArea(street_map.walkable)
     rng = np.random.default_rng(1)
