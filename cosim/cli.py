@@ -71,6 +71,9 @@ def run(
         str | None, typer.Option("--map", help="Draw routes on this map (`cosim map list`) in place of the suite's.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the routes drawn with --map.")] = 0,
+    roughness: Annotated[
+        float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
+    ] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
 ) -> None:
     """Run a suite with a policy and print its table."""
@@ -84,7 +87,9 @@ def run(
     if map_name is not None:
         from scenarios.sample import suite_on_map
 
-        whole = suite_on_map(suite, map_name, seed, episodes or 1)
+        whole = suite_on_map(suite, map_name, seed, episodes or 1, roughness or 0.0)
+    elif roughness is not None:
+        raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
         whole = shipped(suite)
     picked = chosen(whole, scenario or (), episodes)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich import box
 from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
 from cosim.box import box_of
@@ -17,7 +18,7 @@ from cosim.box import box_of
 if TYPE_CHECKING:
     from cosim.report.above import Image
     from cosim.streetmap import StreetMap
-    from sumo_nets.census import Census
+    from scenarios.survey import Survey
 
 city_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Generated cities, from a seed.")
 out = Console()
@@ -27,31 +28,34 @@ Seed = Annotated[int, typer.Option(min=0, help="Every seed is another city.")]
 Size = Annotated[float, typer.Option(help="Side of its square in metres, 200 to 4000.")]
 Style = Annotated[str, typer.Option(help="mixed, downtown or suburb.")]
 
-FIGURES: tuple[tuple[str, Callable[[Census], float], str], ...] = (
-    ("straight", lambda c: c.blocks["straight"], "d"),
-    ("curve", lambda c: c.blocks["curve"], "d"),
-    ("S", lambda c: c.blocks["s_bend"], "d"),
-    ("T", lambda c: c.blocks["t_junction"], "d"),
-    ("X", lambda c: c.blocks["x_junction"], "d"),
-    ("Y", lambda c: c.blocks["y_junction"], "d"),
-    ("round", lambda c: c.blocks["roundabout"], "d"),
-    ("walk km", lambda c: c.sidewalk_km, ".1f"),
-    ("walk %", lambda c: 100.0 * c.walkable_share, ".1f"),
-    ("cross", lambda c: c.crossings, "d"),
-    ("lit", lambda c: c.signalised, "d"),
-    ("mid", lambda c: c.crosswalks, "d"),
-    ("refuge", lambda c: c.refuges, "d"),
-    ("drive", lambda c: c.driveways, "d"),
-    ("clear m", lambda c: c.clear_m, ".2f"),
-    ("far km", lambda c: c.longest_m / 1000.0, ".2f"),
-    ("one %", lambda c: 100.0 * c.one_piece, ".1f"),
+FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
+    ("straight", lambda s: s.census.blocks["straight"], "d"),
+    ("curve", lambda s: s.census.blocks["curve"], "d"),
+    ("S", lambda s: s.census.blocks["s_bend"], "d"),
+    ("T", lambda s: s.census.blocks["t_junction"], "d"),
+    ("X", lambda s: s.census.blocks["x_junction"], "d"),
+    ("Y", lambda s: s.census.blocks["y_junction"], "d"),
+    ("round", lambda s: s.census.blocks["roundabout"], "d"),
+    ("walk km", lambda s: s.census.sidewalk_km, ".1f"),
+    ("walk %", lambda s: 100.0 * s.census.walkable_share, ".1f"),
+    ("cross", lambda s: s.census.crossings, "d"),
+    ("lit", lambda s: s.census.signalised, "d"),
+    ("mid", lambda s: s.census.crosswalks, "d"),
+    ("refuge", lambda s: s.census.refuges, "d"),
+    ("drive", lambda s: s.census.driveways, "d"),
+    ("props", lambda s: s.props, "d"),
+    ("side m", lambda s: s.side_m, ".2f"),
+    ("clear m", lambda s: s.census.clear_m, ".2f"),
+    ("far km", lambda s: s.census.longest_m / 1000.0, ".2f"),
+    ("one %", lambda s: 100.0 * s.census.one_piece, ".1f"),
 )
 """Columns of the table: head, value, format."""
 
 MEANING = (
     "straight, curve, S: streets; T, X, Y, round: junctions; walk km, walk %: sidewalks, share of the city's area; "
     "cross, lit, mid, refuge: crossings, with signals, in mid-street, with an island; drive: driveways; "
-    "clear m: free width everywhere; far km: longest shortest walk; one %: of the walkable area in one piece"
+    "props: street furniture; side m: least width beside it on any sidewalk; clear m: width that passes everywhere, "
+    "furniture included (2 at most); far km: longest shortest walk; one %: of the walkable area in one piece"
 )
 
 
@@ -70,24 +74,26 @@ def make(
     out.print(f"{folder}: {made.name}, net {made.net_hash}", soft_wrap=True, highlight=False)
 
 
-@city_app.command(epilog="Example:  \n`cosim city table --count 10`")
+@city_app.command(epilog="Example:  \n`cosim city table --count 10 --jobs 2`")
 def table(
     count: Annotated[int, typer.Option(min=1, max=100, help="How many of the shipped cities.")] = 100,
     size: Size = 2000.0,
     style: Style = "mixed",
+    jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.3 GiB each.")] = 1,
 ) -> None:
-    """Count what the shipped cities are made of, and check them. Exit code 1: one breaks a promise."""
-    from sumo_nets.census import census
+    """Count what the shipped cities are made of, furniture included, and check them. Exit code 1: one breaks a
+    promise."""
+    from scenarios.survey import surveys
     from sumo_nets.seeds import shipped_cities
-    from sumo_nets.store import city_net
 
     cities = shipped_cities(count, size, style)
-    found: list[Census] = []
-    with err.status("counting ...") as status:
-        for city in cities:
-            status.update(f"counting {city.name} ({len(found) + 1} of {count})")
-            found.append(census(city_net(city)))
-    print_cities([city.seed for city in cities], found)
+    found: list[Survey] = []
+    with _bar() as bar:
+        task = bar.add_task("cities", total=count)
+        for one in surveys(cities, jobs):
+            found.append(one)
+            bar.advance(task)
+    print_cities(found)
     if any(one.faults for one in found):
         raise typer.Exit(1)
 
@@ -113,12 +119,12 @@ def draw(
     out.print(f"Picture: {picture}", soft_wrap=True)
 
 
-def print_cities(seeds: Sequence[int], found: Sequence[Census]) -> None:
+def print_cities(found: Sequence[Survey]) -> None:
     """A row per city, the spans of all, widths of the zones, and whatever is wrong."""
     heads = [Column(head, justify="right", no_wrap=True) for head, _, _ in FIGURES]
     shown = Table(Column("seed", no_wrap=True), *heads, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1))
-    for seed, one in zip(seeds, found, strict=True):
-        shown.add_row(str(seed), *(format(value(one), form) for _, value, form in FIGURES))
+    for one in found:
+        shown.add_row(str(one.seed), *(format(value(one), form) for _, value, form in FIGURES))
     shown.add_section()
     for name, pick in (("min", min), ("median", statistics.median), ("max", max)):
         cells = [
@@ -127,20 +133,32 @@ def print_cities(seeds: Sequence[int], found: Sequence[Census]) -> None:
             for x in [pick([value(one) for one in found])]
         ]
         shown.add_row(name, *cells)
-    wide = Console(width=max(out.width, 130))
+    wide = Console(width=max(out.width, 140))
     wide.print(shown)
     zones = Table("zone", "narrowest m", "median m", "widest m", box=box.SIMPLE_HEAD)
-    for zone in found[0].zones:
-        spans = [one.zones[zone] for one in found]
+    for zone in found[0].census.zones:
+        spans = [one.census.zones[zone] for one in found]
         middle = statistics.median(span.middle for span in spans)
         zones.add_row(zone, f"{min(s.low for s in spans):.2f}", f"{middle:.2f}", f"{max(s.high for s in spans):.2f}")
     out.print(zones)
     out.print(MEANING)
-    faulty = [(seed, fault) for seed, one in zip(seeds, found, strict=True) for fault in one.faults]
+    faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:
         out.print(f"city {seed}: {fault}", soft_wrap=True, markup=False, highlight=False)
-    signals = sum(one.signals for one in found)
+    signals = sum(one.census.signals for one in found)
     out.print(f"{len(found)} cities, {signals} traffic lights checked, {len(faulty)} faults", highlight=False)
+    narrowest, tightest = min(one.side_m for one in found), min(one.census.clear_m for one in found)
+    out.print(
+        f"least width beside furniture on any sidewalk {narrowest:.2f} m, passing everywhere {tightest:.2f} m; "
+        f"memory of a process {max(one.memory_mib for one in found):.0f} MiB at most",
+        soft_wrap=True,
+        highlight=False,
+    )
+
+
+def _bar() -> Progress:
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    return Progress(*columns, TimeRemainingColumn(), console=err)
 
 
 def _picture(street_map: StreetMap, part: tuple[float, float, float, float]) -> Image:

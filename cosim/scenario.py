@@ -19,7 +19,25 @@ SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
 
 
-class City(msgspec.Struct, frozen=True, kw_only=True, tag="city", tag_field="kind"):
+class _Uneven(msgspec.Struct, frozen=True, kw_only=True):
+    """A place whose ground may be uneven. roughness: from 0 (flat) to 1; a spec of flat ground does not mention it,
+    so that it keeps the hash it had before there was uneven ground."""
+
+    roughness: float | msgspec.UnsetType = msgspec.UNSET
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.unevenness <= 1.0:
+            raise SpecError(f"roughness is {self.unevenness:g}, but it lies between 0 (flat) and 1")
+        if self.roughness == 0.0:
+            msgspec.structs.force_setattr(self, "roughness", msgspec.UNSET)
+
+    @property
+    def unevenness(self) -> float:
+        """The roughness of the ground, 0 where the spec does not mention it."""
+        return 0.0 if isinstance(self.roughness, msgspec.UnsetType) else self.roughness
+
+
+class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
     """A procedural city. net_hash: content hash of the street net the scenario was made on."""
 
     seed: int
@@ -32,7 +50,7 @@ class City(msgspec.Struct, frozen=True, kw_only=True, tag="city", tag_field="kin
         return f"city-{self.style}-{self.size_m:g}m-{self.seed}"
 
 
-class CityMap(msgspec.Struct, frozen=True, kw_only=True, tag="map", tag_field="kind"):
+class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
     """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
 
     map: str

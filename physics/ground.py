@@ -7,6 +7,7 @@ from collections import OrderedDict
 from typing import Final
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike
 
 from cosim.errors import UsageError
@@ -17,7 +18,7 @@ from physics.furniture import Prop
 from physics.materials import Paving
 from physics.placement import Placement
 from physics.robots import RobotModel
-from physics.tiles import Key, Tile, build_tile, key_at
+from physics.tiles import Key, Tile, build_tile, key_at, square
 
 _KEPT: Final = 100
 
@@ -57,6 +58,17 @@ class Ground:
         props = self._placement.in_tile(key)
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         return tuple(zip(props, heights.tolist(), strict=True))
+
+    def standing(self, area: shapely.Geometry) -> list[Prop]:
+        """Props in the tiles that an area touches."""
+        x0, y0, x1, y1 = shapely.bounds(area).tolist()
+        (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+        squares = np.array([shapely.box(*square(key)) for key in keys], dtype=object)
+        shapely.prepare(area)
+        return [
+            prop for k in np.flatnonzero(shapely.intersects(area, squares)) for prop in self._placement.in_tile(keys[k])
+        ]
 
     def _trees(self, key: Key) -> list[tuple[float, float]]:
         """Where trees stand in a tile and around it."""

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from cosim.geometry import Floats, Polyline
+from cosim.geometry import Polyline
 from cosim.streetmap import Lane, PieceKind, StreetMap, Strip
 from physics.buildings import Frontage
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Kind, Prop, Zone, footprints
@@ -40,7 +40,6 @@ _ZONE_MAX_M: Final = 6.0
 _REACH_M: Final = 12.0
 """Props stand nearer than this to their sidewalk, and the middle of a house to its walls."""
 
-_STATION_M: Final = 0.25
 _STREET: Final[tuple[PieceKind, ...]] = ("strip", "corner", "lane", "junction")
 _BY_TYPE: Final = (
     (("motorway", "trunk", "primary", "secondary"), "avenue"),
@@ -197,50 +196,27 @@ def street_style(street_class: str) -> str:
     return next((ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential")
 
 
-def clear_width(
-    street_map: StreetMap, strips: Iterable[Strip], props: Sequence[Prop]
-) -> Mapping[str, tuple[float, float]]:
-    """For each sidewalk the least width in metres that is free on both sides of its middle line: as it is, and as it
-    would be without props.
+def standing(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
+    """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
+    placement = Placement(street_map, seed, Frontage(street_map, seed))
+    return tuple(prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
 
-    Measured on lines across the sidewalk, cut by its polygon and by the props' footprints: every quarter of a metre
-    and at the middle and the ends of every prop.
-    """
-    ground = footprints(props)
-    tree = shapely.STRtree(ground)
-    found = {}
-    for strip in strips:
-        line = Polyline(strip.line)
-        near = ground[np.sort(tree.query(strip.polygon, predicate="intersects"))]
-        corners = shapely.points(shapely.get_coordinates(near))
-        stations = np.concatenate([
-            np.linspace(0.0, line.length_m, max(int(line.length_m / _STATION_M), 1) + 1)[1:-1],
-            np.asarray(shapely.line_locate_point(shapely.linestrings(line.points), corners), dtype=float),
-        ])  # fmt: skip
-        if not len(stations):
-            stations = np.array([0.5 * line.length_m])
-        across, middles = _across(line, stations, 0.5 * strip.width_m + 0.5)
-        bare = _free(across, middles, strip.polygon)
-        free = _free(across, middles, shapely.difference(strip.polygon, shapely.union_all(near))) if len(near) else bare
-        found[strip.id] = float(free.min()), float(bare.min())
+
+def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
+    """For each driveway of a sidewalk what must stay open: its way from the road through verge, sidewalk and frontage,
+    and the flares of its ramp."""
+    line = Polyline(strip.line)
+    found: list[shapely.Geometry] = []
+    for at_m in strip.driveways:
+        x, y, heading = line.at(at_m)
+        along = 0.5 * DRIVEWAY_M * np.array([math.cos(heading), math.sin(heading)])
+        aside = strip.road_side * np.array([-math.sin(heading), math.cos(heading)])
+        road = np.array([x, y]) + (0.5 * strip.width_m + strip.verge_m) * aside
+        far = np.array([x, y]) - (0.5 * strip.width_m + strip.frontage_m) * aside
+        way = shapely.Polygon([road - along, road + along, far + along, far - along])
+        flares = shapely.buffer(shapely.LineString([road - along, road + along]), RAMP_M)
+        found.append(shapely.union(way, flares))
     return found
-
-
-def _across(line: Polyline, stations_m: Floats, half_m: float) -> tuple[NDArray[np.object_], NDArray[np.object_]]:
-    """Lines across at arc lengths, and their middles."""
-    poses = np.array([line.at(float(s)) for s in stations_m])
-    aside = half_m * np.column_stack([-np.sin(poses[:, 2]), np.cos(poses[:, 2])])
-    ends = np.stack([poses[:, :2] - aside, poses[:, :2] + aside], axis=1)
-    return np.asarray(shapely.linestrings(ends), dtype=object), np.asarray(shapely.points(poses[:, :2]), dtype=object)
-
-
-def _free(across: NDArray[np.object_], middles: NDArray[np.object_], area: shapely.Geometry) -> Floats:
-    """Lengths of those parts of lines within an area that hold their middles; 0 where a middle is not free."""
-    parts, line = shapely.get_parts(shapely.intersection(across, area), return_index=True)
-    held = shapely.dwithin(parts, middles[line], 1e-6)
-    free = np.zeros(len(across))
-    np.maximum.at(free, line[held], shapely.length(parts[held]))
-    return free
 
 
 def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]) -> NDArray[np.bool_]:
@@ -253,6 +229,8 @@ def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: ND
         is_crossing = isinstance(piece, Strip) and piece.kind == "crossing"
         taken.append(shapely.buffer(piece.polygon, END_M) if is_crossing else piece.polygon)
     free = ~_meets(ground, taken, 0.02)
+    ways = [way for s in street_map.near("strip", area) if isinstance(s, Strip) for way in driveway_ground(s)]
+    free &= ~_meets(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
     half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
     free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
     one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=GAP_M)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 import shapely
-from shapely.geometry import LineString
+from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from bridge import keys
 from bridge.director import RemoteDirector, serve_director
@@ -22,6 +22,7 @@ from cosim.ports import Director, Policy
 from cosim.scenario import City, Place, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
 from physics.camera import BulletCamera
+from physics.furniture import Prop, footprints
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
@@ -50,10 +51,13 @@ def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
     manifest = policy.manifest
     clock = Clock.for_rate(manifest.rate_hz)
     net_path, street_map = place(scenario.place)
-    walkable = street_map.walkable_near(shapely.buffer(LineString(scenario.route), CORRIDOR_M))
+    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+    walkable = street_map.walkable_near(around)
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     with ExitStack() as stack:
-        world = BulletWorld(street_map, scenario.place.seed, scenario.barriers, scenario.robot)
+        world = BulletWorld(
+            street_map, scenario.place.seed, scenario.barriers, scenario.robot, scenario.place.unevenness
+        )
         stack.enter_context(world)
         crowd = SumoCrowd(
             net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2], world.footprint_m
@@ -64,10 +68,18 @@ def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
             camera = stack.enter_context(BulletCamera(world, manifest.camera))
         director = stack.enter_context(directed(scenario.id))
         half_width_m = world.footprint_m[1] / 2
-        free = shapely.buffer(fenced(walkable, scenario.barriers), -half_width_m)
+        footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
+        free = shapely.buffer(footing, -half_width_m)
         shapely.prepare(free)
         parts = Parts(world, crowd, director, policy, camera, Limits(), free)
         yield Stage(parts, WalkableArea(walkable), clock, "bullet-tiny" if camera else "none")
+
+
+def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:
+    """An area minus the ground that props cover; the area itself where none stands on it."""
+    ground = footprints(props)
+    ground = ground[shapely.intersects(area, ground)]
+    return shapely.difference(area, shapely.union_all(ground)) if len(ground) else area  # type: ignore[return-value]
 
 
 @contextmanager

@@ -56,7 +56,8 @@ class Census(NamedTuple):
 
     blocks: how many of each of BLOCKS. zones: widths in metres, one value per sidewalk; missing: streets where a
     zone cannot be read back. crosswalks: crossings in the middle of a street; refuges: crossings with an island.
-    one_piece: share of the walkable area in its largest part. clear_m: free width everywhere on the walkable ground.
+    one_piece: share of the walkable area in its largest part. clear_m: free width everywhere on the walkable ground,
+    what was said to stand on it apart.
     longest_m: the longest of all shortest walks that was found. faults: what breaks the promises of a city.
     """
 
@@ -88,8 +89,9 @@ class _Way(NamedTuple):
     line: Floats
 
 
-def census(path: Path, street_map: StreetMap | None = None) -> Census:
-    """Count a city's net. street_map: of the same file, when it has been read already."""
+def census(path: Path, street_map: StreetMap | None = None, standing: Sequence[shapely.Geometry] = ()) -> Census:
+    """Count a city's net. street_map: of the same file, when it has been read already; standing: ground that is
+    covered by furniture."""
     place = read_net(path) if street_map is None else street_map
     net = path.read_bytes()
     root = ET.fromstring(net)
@@ -117,17 +119,22 @@ def census(path: Path, street_map: StreetMap | None = None) -> Census:
         signals=sum(junction.signalised for junction in place.junctions.values()),
         driveways=sum(len(strip.driveways) for strip in sidewalks),
         one_piece=max(areas) / sum(areas),
-        clear_m=clear_width_m(place),
+        clear_m=clear_width_m(place, standing),
         longest_m=longest_walk_m(WalkGraph(place)),
         faults=(),
     )
     return found._replace(faults=tuple(_faults(found, place, signal_faults(net))))
 
 
-def clear_width_m(place: StreetMap, widest_m: float = 2.0, step_m: float = 0.05) -> float:
-    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable ground still has one
-    piece that holds the middles of all strips."""
-    ground = shapely.simplify(place.walkable, 0.01)
+def clear_width_m(
+    place: StreetMap, standing: Sequence[shapely.Geometry] = (), widest_m: float = 2.0, step_m: float = 0.05
+) -> float:
+    """The largest width, in steps, that passes everywhere: shrunk by half of it, the walkable ground around what
+    stands on it still has one piece that holds the middles of all strips."""
+    ground: shapely.Geometry = shapely.simplify(place.walkable, 0.01)
+    shapely.prepare(ground)
+    if in_the_way := [thing for thing in standing if shapely.intersects(ground, thing)]:
+        ground = shapely.difference(ground, shapely.union_all(in_the_way))
     lines = shapely.linestrings(
         np.concatenate([strip.line[:, :2] for strip in place.strips.values()]),
         indices=np.repeat(np.arange(len(place.strips)), [len(strip.line) for strip in place.strips.values()]),

@@ -21,9 +21,10 @@ from cosim.state import LABELS, Command, RobotState, Street
 from cosim.streetmap import StreetMap, Strip
 from physics.buildings import Frontage
 from physics.camera import BulletCamera
+from physics.clearance import clear_width, on_driveways
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
 from physics.materials import MATERIALS, PAVINGS, Paving, friction, street_of
-from physics.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, clear_width, street_style
+from physics.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, street_style
 from physics.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.world import BulletWorld
 from sumo_nets.netfile import read_net
@@ -159,10 +160,10 @@ def test_the_checker_finds_a_prop_in_the_way() -> None:
     """The least free width over the middle is measured at the prop, and is 0 where it stands on the middle line."""
     strip = MAP.strips["nw"]
     bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
-    width, bare = clear_width(MAP, [strip], [bench])["nw"]
+    width, bare = clear_width([strip], [bench])["nw"]
     assert (width, bare) == (pytest.approx(3.0 - 0.3 - 0.225), pytest.approx(3.0))
     middle = dataclasses.replace(bench, y_m=5.0)
-    assert clear_width(MAP, [strip], [middle])["nw"][0] == 0.0
+    assert clear_width([strip], [middle])["nw"][0] == 0.0
 
 
 @pytest.mark.engine
@@ -171,9 +172,26 @@ def test_generated_cities_leave_a_way(seed: int) -> None:
     """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is furniture."""
     street_map = city(seed)
     strips, props = sidewalks(street_map), all_props(street_map, seed)
-    widths = clear_width(street_map, strips, props)
+    widths = clear_width(strips, props)
     assert min(free for free, _ in widths.values()) >= 1.2 - 1e-6
     assert len(props) > 0.06 * sum(strip.length_m for strip in strips)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("seed", [11, 37, 5])
+def test_driveways_are_open(seed: int) -> None:
+    """Nothing but parked cars, behind the sidewalk, stands where a driveway or the flares of its ramp are."""
+    street_map = city(seed)
+    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    assert sum(len(strip.driveways) for strip in strips) > 20
+    assert on_driveways(strips, props) == []
+    cars = [prop for prop in props if prop.kind == "car"]
+    assert cars
+    for car, footprint in zip(cars, footprints(cars), strict=True):
+        assert shapely.distance(footprint, street_map.strips[car.id.split(":")[1]].polygon) > 0.0
+    strip = next(strip for strip in strips if strip.driveways)
+    x, y, heading = Polyline(strip.line).at(strip.driveways[0])
+    assert on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == ["prop:here:0"]
 
 
 @pytest.mark.engine
@@ -182,7 +200,7 @@ def test_generated_cities_leave_a_way(seed: int) -> None:
 def test_foreign_maps_leave_a_way(path: Path) -> None:
     """Props take nothing from a sidewalk below 1.2 m: what is narrower stays as it is."""
     street_map = read_net(path)
-    widths = clear_width(street_map, sidewalks(street_map), all_props(street_map, 3))
+    widths = clear_width(sidewalks(street_map), all_props(street_map, 3))
     assert all(free >= min(1.2, bare) - 1e-6 for free, bare in widths.values())
 
 

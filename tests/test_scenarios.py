@@ -17,7 +17,7 @@ from cosim.errors import SpecError
 from cosim.geometry import Polyline
 from cosim.policies import POLICIES
 from cosim.ports import Privileged
-from cosim.scenario import Scenario, content_hash, read_suite, write_suite
+from cosim.scenario import City, CityMap, Scenario, content_hash, read_suite, write_suite
 from cosim.state import NO_VEHICLES, NOBODY, RobotState
 from cosim.streetmap import Corner, Port, StreetMap, Strip, WalkableArea
 from cosim.walks import WalkGraph
@@ -49,6 +49,33 @@ def test_a_suite_survives_its_file(tmp_path: Path) -> None:
     write_suite(whole, tmp_path / "s.json")
     again = read_suite(tmp_path / "s.json")
     assert again == whole and again.content_hash == whole.content_hash
+
+
+def test_a_place_says_how_rough_its_ground_is() -> None:
+    """Flat ground leaves a spec and its hash as they were; roughness survives the file; out of range is refused."""
+    flat, rough = City(seed=1, roughness=0.0), CityMap(map="m", roughness=0.4)
+    assert flat == City(seed=1) and b"roughness" not in msgspec.json.encode(flat)
+    assert flat.unevenness == 0.0 and rough.unevenness == 0.4
+    assert msgspec.json.decode(msgspec.json.encode(rough), type=CityMap) == rough
+    assert content_hash(rough) != content_hash(CityMap(map="m"))
+    for bad in (-0.1, 1.5, float("nan")):
+        with pytest.raises(SpecError, match=r"roughness is \S+, but it lies between 0 \(flat\) and 1"):
+            City(seed=1, roughness=bad)
+
+
+@pytest.mark.engine
+def test_free_space_ends_at_furniture() -> None:
+    """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
+    from physics.furniture import Prop, footprints
+    from scenarios.assemble import clear_of
+
+    area = cross_map().walkable
+    post = Prop("prop:east:0", "lamp", 0, 20.0, 1.2, 0.0, 0)
+    beside = Prop("prop:east:1", "bench", 0, 20.0, 4.0, 0.0, 0)
+    assert clear_of(area, [beside]) is area and clear_of(area, []) is area
+    free = clear_of(area, [post, beside])
+    assert free.area == pytest.approx(area.area - footprints([post])[0].area)
+    assert not free.intersects(Point(20.0, 1.2))
 
 
 @pytest.mark.engine
