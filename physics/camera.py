@@ -15,15 +15,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.errors import EngineError
-from cosim.geometry import Floats
 from cosim.ports import CameraSpec
 from cosim.state import LABELS, Frame, RobotState, Street
 from physics.canvas import Canvas
-from physics.scene import Scene, View
+from physics.scene import Scene
+from physics.view import FAR_M, NEAR_M, Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
 
-NEAR_M: Final = 0.05
-FAR_M: Final = 160.0
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
 _ZENITH: Final = np.array([92.0, 142.0, 205.0], dtype=np.float32)
 _TILES_MAX: Final = 150
@@ -36,6 +34,7 @@ class BulletCamera:
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False) -> None:
+        check_size(spec.width, spec.height, spec.fov_deg)
         self.spec = spec
         self._world = world
         self._depth = depth
@@ -61,12 +60,7 @@ class BulletCamera:
 
     def render(self, robot: RobotState, street: Street) -> Frame:
         """What the robot sees from its mount; it leans with the ground, and its own body is not in the picture."""
-        spec = self.spec
-        turn = self._attitude(robot)
-        eye = np.array([robot.pose.x_m, robot.pose.y_m, robot.z_m]) + turn @ np.array(spec.mount_m)
-        down = math.radians(spec.pitch_down_deg)
-        ahead = turn @ np.array([math.cos(down), 0.0, -math.sin(down)])
-        return self._drawn(eye, eye + ahead, (spec.width, spec.height), spec.fov_deg, street, None)
+        return self._drawn(robot_shot(self._world.ground, self._world.model, self.spec, robot), street, None)
 
     def picture(
         self,
@@ -78,48 +72,25 @@ class BulletCamera:
         fov_deg: float = 60.0,
     ) -> Frame:
         """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
-        eye, target = np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float)
-        return self._drawn(eye, target, size, fov_deg, street, robot)
+        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot)
 
-    def _drawn(
-        self,
-        eye: Floats,
-        target: Floats,
-        size: tuple[int, int],
-        fov_deg: float,
-        street: Street,
-        robot: RobotState | None,
-    ) -> Frame:
+    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None) -> Frame:
         if self._scene is not None and self._scene.built > _TILES_MAX:
             self.close()
             self.__enter__()
         if self._canvas is None or self._scene is None:
             raise EngineError("the camera is not running: use BulletCamera in a 'with' block")
-        ahead = target - eye
-        steep = math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
-        half_up = math.radians(0.5 * fov_deg)
-        half_wide = math.atan(math.tan(half_up) * size[0] / size[1] / max(math.cos(abs(steep) + half_up), 0.05))
-        self._scene.arrange(View(eye, math.atan2(ahead[1], ahead[0]), half_wide), street)
+        self._scene.arrange(taken.view, street)
         if robot is not None:
             _, roll, pitch = self._world.ground.lean(robot.pose, self._world.model)
             self._scene.show_robot(robot.pose, robot.z_m, roll, pitch)
-        rgb, labels, depth = self._canvas.draw(eye, target, size, fov_deg, NEAR_M, FAR_M)
+        rgb, labels, depth = self._canvas.draw(taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_M, FAR_M)
         nothing = labels == LABELS["sky"]
-        sky, below = _sky(size[1], fov_deg, round(steep, 4))
+        sky, below = _sky(taken.size[1], taken.fov_deg, round(taken.steep_rad, 4))
         rgb = _hazy(rgb, depth)
         rgb[nothing] = np.broadcast_to(sky, rgb.shape)[nothing]
         labels[nothing & below] = LABELS["ground"]
         return Frame(rgb, labels, depth if self._depth else None)
-
-    def _attitude(self, robot: RobotState) -> NDArray[np.float64]:
-        """(3, 3) rotation from the base frame to the world: heading, and the slope of the ground."""
-        _, roll, pitch = self._world.ground.lean(robot.pose, self._world.model)
-        cz, sz = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
-        cy, sy, cx, sx = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
-        yaw = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-        tilt = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-        lean = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-        return np.asarray(yaw @ tilt @ lean)
 
 
 def _hazy(rgb: NDArray[np.uint8], depth: NDArray[np.float32]) -> NDArray[np.uint8]:

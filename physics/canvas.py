@@ -94,7 +94,10 @@ class Canvas:
         """Colours (H, W, 3), labels (H, W) and depth along the view (H, W) in metres. size: width, height."""
         width, height = size
         view = p.computeViewMatrix(eye_m.tolist(), target_m.tolist(), (0.0, 0.0, 1.0))
-        projection = p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m)
+        projection = list(p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m))
+        # TinyRenderer looks through a corner of each pixel: half a pixel aside, and it looks through the middle.
+        projection[8] += 1.0 / width
+        projection[9] += 1.0 / height
         _, _, rgba, depth, mask = p.getCameraImage(
             width,
             height,

@@ -12,6 +12,7 @@ from cosim.geometry import Polyline
 from cosim.scenario import Barrier
 from cosim.streetmap import StreetMap, Strip
 from physics.mesh import Mesh, box, join
+from physics.tiles import Key, key_at, square
 
 RED: Final = (0.82, 0.10, 0.09)
 WHITE: Final = (0.93, 0.93, 0.91)
@@ -49,6 +50,15 @@ class SignalPost:
     x_m: float
     y_m: float
     heading_rad: float
+
+
+def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
+    """The pedestrian signals that stand in a tile."""
+    x0, y0, x1, y1 = square(key)
+    strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
+    crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
+    posts = [post for s in crossings for post in signal_posts(street_map, s)]
+    return [post for post in posts if key_at(post.x_m, post.y_m) == key]
 
 
 def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, SignalPost]:

@@ -5,44 +5,21 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
-import shapely
-from numpy.typing import NDArray
 
 from cosim.clock import Clock
 from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import People, Street, Vehicles
-from cosim.streetmap import Strip
 from physics import people, props, vehicles
 from physics.buildings import FACADES, WINDOWS, facade_meshes
 from physics.canvas import Canvas, Colour, Rigs
 from physics.furniture import KINDS, Prop, parts_of
 from physics.ground import Ground
 from physics.robots import RobotModel
-from physics.tiles import Key, distance_to, key_at, keys_within, square, surface
-
-VISIBLE_M: Final = 50.0
-_FORGET_M: Final = 70.0
-
-
-@dataclass(frozen=True, slots=True)
-class View:
-    """Where a picture is taken from. eye_m: (3,); heading_rad of the view; half_angle_rad: half its width."""
-
-    eye_m: Floats
-    heading_rad: float
-    half_angle_rad: float
-
-    def rows(self, xy: Floats, margin_m: float) -> NDArray[np.intp]:
-        """Which of (N, 2) points can be in the picture, things of radius `margin_m` standing on them."""
-        offset = xy - self.eye_m[:2]
-        cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
-        ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
-        wide = aside * math.cos(self.half_angle_rad) - ahead * math.sin(self.half_angle_rad)
-        return np.flatnonzero((wide < margin_m) & (ahead > -margin_m) & (np.hypot(ahead, aside) < VISIBLE_M))
+from physics.tiles import Key, distance_to, keys_within, square, surface
+from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +78,7 @@ class Scene:
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
-        for key in [k for k in self._tiles if distance_to(k, x, y) > _FORGET_M]:
+        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
             self._canvas.remove(list(self._tiles.pop(key).bodies))
             self._shown.discard(key)
         wanted = set(keys_within(x, y, VISIBLE_M))
@@ -125,11 +102,7 @@ class Scene:
             parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
         bodies = {self._canvas.add(mesh.moved(-middle), colour, label): (at, 0.0) for mesh, colour, label in parts}
-        street_map = self._ground.street_map
-        strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
-        crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
-        posts = [post for s in crossings for post in props.signal_posts(street_map, s)]
-        posts = [post for post in posts if key_at(post.x_m, post.y_m) == key]
+        posts = props.posts_in(self._ground.street_map, key)
         for post in posts:
             bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
         furniture = self._ground.props(key)
@@ -140,7 +113,7 @@ class Scene:
         return post.x_m, post.y_m, float(self._ground.heights([[post.x_m, post.y_m]])[0])
 
     def _show_people(self, view: View, who: People, time_s: float) -> None:
-        rows = view.rows(who.xy, 1.0)
+        rows = view.rows(who.xy, PERSON_MARGIN_M)
         z = self._ground.heights(who.xy[rows])
         about_y, about_z = people.swings(who, time_s)
         self._walkers.start()
@@ -158,7 +131,7 @@ class Scene:
     def _show_vehicles(self, view: View, which: Vehicles) -> None:
         for rigs in self._vehicles.values():
             rigs.start()
-        for i in view.rows(which.xy, 6.0):
+        for i in view.rows(which.xy, VEHICLE_MARGIN_M):
             size = (round(float(which.size[i, 0]), 1), round(float(which.size[i, 1]), 1))
             if size not in self._vehicles:
                 self._vehicles[size] = Rigs(self._canvas, vehicles.vehicle_meshes(*size), "vehicle")
@@ -190,7 +163,7 @@ class Scene:
             tile = self._tiles[key]
             if not tile.furniture:
                 continue
-            rows = view.rows(tile.furniture_xy, 2.5)
+            rows = view.rows(tile.furniture_xy, PROP_MARGIN_M)
             gap = np.hypot(*(tile.furniture_xy[rows] - view.eye_m[:2]).T)
             for i in rows[gap < tile.seen_m[rows]].tolist():
                 prop, z = tile.furniture[i]

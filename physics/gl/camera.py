@@ -1,0 +1,107 @@
+"""GlCamera: pictures by OpenGL, on a GPU or on a processor that plays one.
+
+A picture is a function of the robot's state and the street alone: same values, same pixels on the same renderer,
+whatever was drawn before.
+"""
+
+from __future__ import annotations
+
+from types import TracebackType
+from typing import Final, Self
+
+import moderngl
+import numpy as np
+from numpy.typing import ArrayLike
+
+from cosim.errors import EngineError
+from cosim.ports import CameraSpec
+from cosim.state import Frame, RobotState, Street
+from physics.gl.backdrop import Backdrop
+from physics.gl.context import context
+from physics.gl.scene import Scene
+from physics.gl.shading import DAY, Lighting, SceneBlock, anchor_of, camera_matrix
+from physics.gl.targets import Target
+from physics.view import Shot, check_size, robot_shot, shot
+from physics.world import BulletWorld
+
+_TARGETS_MAX: Final = 4
+
+
+class GlCamera:
+    """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
+
+    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Lighting = DAY) -> None:
+        check_size(spec.width, spec.height, spec.fov_deg)
+        self.spec = spec
+        self._world, self._depth, self._light = world, depth, light
+        self._context: moderngl.Context | None = None
+        self._targets: dict[tuple[int, int], Target] = {}
+
+    def __enter__(self) -> Self:
+        if self._context is None:
+            world, shadows = self._world, self._light.shadows > 0.0
+            with context() as gl:
+                self._scene = Scene(gl, world.ground, world.barriers, world.model, shadows)
+                self._block = SceneBlock(gl)
+                self._backdrop = Backdrop(gl)
+            self._context = gl
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Free what the camera holds; a second call does nothing."""
+        if self._context is not None:
+            with self._context:
+                self._scene.release()
+                self._block.release()
+                self._backdrop.release()
+                while self._targets:
+                    self._targets.popitem()[1].release()
+            self._context = None
+
+    def render(self, robot: RobotState, street: Street) -> Frame:
+        """What the robot sees from its mount; it leans with the ground, and its own body is not in the picture."""
+        return self._drawn(robot_shot(self._world.ground, self._world.model, self.spec, robot), street, None)
+
+    def picture(
+        self,
+        eye_m: ArrayLike,
+        target_m: ArrayLike,
+        street: Street,
+        robot: RobotState | None = None,
+        size: tuple[int, int] = (640, 480),
+        fov_deg: float = 60.0,
+    ) -> Frame:
+        """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
+        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot)
+
+    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None) -> Frame:
+        if self._context is None:
+            raise EngineError("the camera is not running: use GlCamera in a 'with' block")
+        with self._context as gl:
+            target = self._target(taken.size)
+            anchor = anchor_of(taken.eye_m)
+            self._scene.arrange(taken, anchor, street, robot)
+            self._block.write(camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
+            target.frame.use()
+            gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            gl.front_face = "cw"  # the picture is drawn upside down, to be read top first
+            gl.depth_func = "<"
+            target.frame.clear(depth=1.0)
+            self._scene.draw("colour")
+            gl.depth_func = "<="
+            self._backdrop.draw(self._light.zenith)
+            rgb, labels = target.read()
+            return Frame(rgb, labels, target.read_depth() if self._depth else None)
+
+    def _target(self, size: tuple[int, int]) -> Target:
+        if size not in self._targets:
+            assert self._context is not None
+            if len(self._targets) == _TARGETS_MAX:
+                self._targets.pop(next(iter(self._targets))).release()
+            self._targets[size] = Target(self._context, size)
+        return self._targets[size]

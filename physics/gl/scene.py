@@ -1,0 +1,239 @@
+"""The street around a view for the gl camera: the same sets of things as physics.scene, as buffers and instances."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.clock import Clock
+from cosim.geometry import Floats
+from cosim.scenario import Barrier
+from cosim.state import LABELS, People, RobotState, Street, Vehicles
+from physics import people, props, vehicles
+from physics.furniture import KINDS, parts_of
+from physics.gl.corners import Rows
+from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
+from physics.gl.robot_body import robot_parts
+from physics.gl.shading import Stage
+from physics.gl.tiles import TileBuffers, tile_programs
+from physics.ground import Ground
+from physics.robots import RobotModel
+from physics.tiles import Key, distance_to, keys_within
+from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
+
+_TILE_REACH_M: Final = 34.0
+"""A tile's farthest point from its middle, and what stands over its border."""
+
+Placed = tuple[NDArray[np.int64], Rows]
+"""Numbers of forms and rows of instances."""
+_NOTHING: Final[Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTANCE))
+
+
+@dataclass(frozen=True, slots=True)
+class _Tile:
+    """A tile on the graphics card, and the things that stand in it, at (N, 2) thing_xy, drawn as far as (N,) seen_m.
+    Their rows are relative to the tile's middle."""
+
+    buffers: TileBuffers
+    things: Placed
+    thing_xy: Floats
+    seen_m: Floats
+    posts: list[props.SignalPost]
+    post_z: Floats
+
+
+class Scene:
+    """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
+
+    def __init__(
+        self, context: moderngl.Context, ground: Ground, barriers: Sequence[Barrier], model: RobotModel, shadows: bool
+    ) -> None:
+        self._context, self._ground, self._model = context, ground, model
+        self._tiles: dict[Key, _Tile] = {}
+        self._shaders = tile_programs(context, shadows)
+        self._forms = Forms(context, shadows)
+        self._seen = Things(context, self._forms, ("colour",))
+        self._around: list[_Tile] = []
+        self._in_view: list[_Tile] = []
+        self._anchor: Floats = np.zeros(2)
+        self._fences = [self._fence(barrier) for barrier in barriers]
+        self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
+        self._parts = [self._forms.id(("person", i), [Coat(p.mesh)]) for i, p in enumerate(people.PARTS)]
+
+    def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None) -> None:
+        """Hold everything that a picture can show."""
+        view, self._anchor = shot.view, anchor
+        self._stream(view)
+        time_s = Clock().time_s(street.tick)
+        placed = [
+            *self._things(view),
+            *self._fences_now(),
+            self._lamps(street),
+            self._people(view.rows(street.people.xy, PERSON_MARGIN_M), street.people, time_s),
+            self._vehicles(view.rows(street.vehicles.xy, VEHICLE_MARGIN_M), street.vehicles),
+        ]
+        if robot is not None:
+            placed.append(self._robot(robot))
+        self._seen.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
+
+    def draw(self, stage: Stage) -> None:
+        """Draw what was arranged: the small and near first, then the ground from near to far."""
+        self._seen.draw(stage)
+        for tile in self._in_view:
+            tile.buffers.draw(stage, self._anchor)
+
+    def release(self) -> None:
+        for tile in self._tiles.values():
+            tile.buffers.release()
+        self._tiles.clear()
+        self._seen.release()
+        self._forms.release()
+
+    def _stream(self, view: View) -> None:
+        x, y = float(view.eye_m[0]), float(view.eye_m[1])
+        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
+            self._tiles.pop(key).buffers.release()
+        keys = sorted(keys_within(x, y, VISIBLE_M), key=lambda key: (distance_to(key, x, y), key))
+        for key in keys:
+            if key not in self._tiles:
+                self._tiles[key] = self._built(key)
+        self._around = [self._tiles[key] for key in keys]
+        middles = np.array([tile.buffers.middle for tile in self._around])
+        self._in_view = [self._around[i] for i in _in_wedge(view, middles, _TILE_REACH_M)]
+
+    def _built(self, key: Key) -> _Tile:
+        buffers = TileBuffers(self._context, self._shaders, self._ground, key)
+        middle = buffers.middle
+        posts = props.posts_in(self._ground.street_map, key)
+        post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
+        post_z = self._ground.heights(post_xy)
+        furniture = self._ground.props(key)
+        form = [self._prop_form(prop.kind, prop.variant) for prop, _ in furniture]
+        xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
+        paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
+        rows = instances(xyz, [prop.heading_rad for prop, _ in furniture], paint, LABELS["prop"])
+        pole = self._forms.id("signal post", [Coat(props.post_mesh(), props.POLE)])
+        headings = [post.heading_rad for post in posts]
+        poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
+        things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
+        seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
+        thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
+        return _Tile(buffers, things, thing_xy, seen_m, posts, post_z)
+
+    def _prop_form(self, kind: str, variant: int) -> int:
+        key = ("prop", kind, variant)
+        if key in self._forms:
+            return self._forms.id(key)
+        return self._forms.id(key, [Coat(part.mesh, part.colour) for part in parts_of(kind, variant)])
+
+    def _things(self, view: View) -> list[Placed]:
+        """What stands in the tiles around, as far as it is drawn."""
+        placed = []
+        for tile in self._around:
+            rows = view.rows(tile.thing_xy, PROP_MARGIN_M)
+            rows = rows[np.hypot(*(tile.thing_xy[rows] - view.eye_m[:2]).T) < tile.seen_m[rows]]
+            placed.append(self._shifted(tile, rows))
+        return placed
+
+    def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> Placed:
+        form, things = tile.things
+        here = things[rows]
+        here["at"][:, :2] += tile.buffers.middle - self._anchor
+        return form[rows], here
+
+    def _fence(self, barrier: Barrier) -> Placed:
+        z = float(self._ground.heights([[barrier.x_m, barrier.y_m]])[0])
+        red, white = props.barrier_meshes(barrier)
+        size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
+        form = self._forms.id(("barrier", size), [Coat(red, props.RED), Coat(white, props.WHITE)])
+        rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.RED, LABELS["barrier"])
+        return np.array([form]), rows
+
+    def _fences_now(self) -> list[Placed]:
+        placed = []
+        for (form, rows), xy in zip(self._fences, self._fence_xy, strict=True):
+            here = rows.copy()
+            here["at"][:, :2] = xy - self._anchor
+            placed.append((form, here))
+        return placed
+
+    def _lamps(self, street: Street) -> Placed:
+        """The lit lamp of every signal whose state is known."""
+        forms, at, heading, paint = [], [], [], []
+        for tile in self._around:
+            for post, z in zip(tile.posts, tile.post_z.tolist(), strict=True):
+                if post.crossing in street.signals:
+                    walk = street.signals[post.crossing].walk
+                    forms.append(self._forms.id(("lamp", walk), [Coat(props.lamp_mesh(walk), None, glows=True)]))
+                    at.append((post.x_m - self._anchor[0], post.y_m - self._anchor[1], z))
+                    heading.append(post.heading_rad)
+                    paint.append(props.LAMPS[walk])
+        if not forms:
+            return _NOTHING
+        return np.array(forms), instances(at, heading, paint, LABELS["signal"])
+
+    def _people(self, rows: NDArray[np.intp], who: People, time_s: float) -> Placed:
+        if len(rows) == 0:
+            return _NOTHING
+        who = People(
+            tuple(who.ids[i] for i in rows), who.xy[rows], who.heading[rows], who.speed[rows],
+            tuple(who.doing[i] for i in rows),
+        )  # fmt: skip
+        about_y, about_z = people.swings(who, time_s)
+        joints = np.array([part.joint_m for part in people.PARTS])
+        cos, sin = np.cos(who.heading)[:, None], np.sin(who.heading)[:, None]
+        foot = np.column_stack([who.xy - self._anchor, self._ground.heights(who.xy)])[:, None]
+        turned = np.stack([cos * joints[:, 0] - sin * joints[:, 1], sin * joints[:, 0] + cos * joints[:, 1]], axis=2)
+        at = foot + np.concatenate([turned, np.broadcast_to(joints[:, 2:], (*turned.shape[:2], 1))], axis=2)
+        paint = np.array([[colours[part.coat] for part in people.PARTS] for colours in map(people.colours, who.ids)])
+        heading = (who.heading[:, None] + about_z).ravel()
+        placed = instances(at.reshape(-1, 3), heading, paint.reshape(-1, 3), LABELS["person"], about_y.ravel())
+        return np.tile(np.array(self._parts), len(who)), placed
+
+    def _vehicles(self, rows: NDArray[np.intp], which: Vehicles) -> Placed:
+        if len(rows) == 0:
+            return _NOTHING
+        forms = []
+        for length, width in which.size[rows].round(1).tolist():
+            key = ("vehicle", length, width)
+            if key not in self._forms:
+                body, glass, tyres = vehicles.vehicle_meshes(length, width)
+                self._forms.id(key, [Coat(body), Coat(glass, vehicles.GLASS), Coat(tyres, vehicles.TYRE)])
+            forms.append(self._forms.id(key))
+        at = np.column_stack([which.xy[rows] - self._anchor, np.zeros(len(rows))])
+        paint = np.array([vehicles.paint(which.ids[i]) for i in rows])
+        return np.array(forms), instances(at, which.heading[rows], paint, LABELS["vehicle"])
+
+    def _robot(self, robot: RobotState) -> Placed:
+        """The robot with its base frame at its pose, leaning with the ground."""
+        form = self._forms.id(("robot", self._model.name), robot_parts(self._model.urdf))
+        _, roll, pitch = self._ground.lean(robot.pose, self._model)
+        rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
+        rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
+        rows["turn"] = _quaternion(roll, pitch, robot.pose.heading_rad)
+        return np.array([form]), rows
+
+
+def _in_wedge(view: View, xy: Floats, margin_m: float) -> list[int]:
+    """Which of (N, 2) points can be in the picture, however far away."""
+    offset = xy - view.eye_m[:2]
+    cos, sin = math.cos(view.heading_rad), math.sin(view.heading_rad)
+    ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
+    wide = aside * math.cos(view.half_angle_rad) - ahead * math.sin(view.half_angle_rad)
+    return [int(i) for i in np.flatnonzero((wide < margin_m) & (ahead > -margin_m))]
+
+
+def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
+    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(0.5 * a), math.sin(0.5 * a)) for a in (roll, pitch, yaw))
+    return (
+        sx * cy * cz - cx * sy * sz,
+        cx * sy * cz + sx * cy * sz,
+        cx * cy * sz - sx * sy * cz,
+        cx * cy * cz + sx * sy * sz,
+    )

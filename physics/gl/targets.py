@@ -1,0 +1,39 @@
+"""Targets: what a picture is drawn into, and how it is read back.
+
+Colour and label share one texture (the label is its fourth channel), so that a picture is one readback.
+"""
+
+from __future__ import annotations
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from physics.view import FAR_M, NEAR_M
+
+
+class Target:
+    """A framebuffer of one size. size: width, height in pixels."""
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
+        self.size = size
+        self._colour = context.renderbuffer(size, 4, dtype="f1")
+        self._depth = context.depth_renderbuffer(size)
+        self.frame = context.framebuffer([self._colour], self._depth)
+
+    def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Colours (H, W, 3) and labels (H, W), the top row first."""
+        width, height = self.size
+        whole = np.frombuffer(self.frame.read(components=4, dtype="f1"), dtype=np.uint8).reshape(height, width, 4)
+        return np.ascontiguousarray(whole[..., :3]), np.ascontiguousarray(whole[..., 3])
+
+    def read_depth(self) -> NDArray[np.float32]:
+        """Depth along the view, (H, W) metres."""
+        width, height = self.size
+        data = self.frame.read(components=1, attachment=-1, dtype="f4")
+        depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
+        return (FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * depth)).astype(np.float32)
+
+    def release(self) -> None:
+        for thing in (self.frame, self._colour, self._depth):
+            thing.release()
