@@ -25,6 +25,7 @@ from rich.progress import (
 from rich.table import Column, Table
 
 from cosim.cli_city import city_app
+from cosim.cli_eyes import film, look
 from cosim.cli_map import map_app
 from cosim.errors import CosimError, UsageError
 
@@ -37,6 +38,10 @@ app = typer.Typer(
 )
 app.add_typer(city_app, name="city")
 app.add_typer(map_app, name="map")
+app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --view above`")(
+    look
+)
+app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
 out = Console()
 err = Console(stderr=True)
 

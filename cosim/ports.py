@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.events import EventQuery, EventReply
@@ -111,6 +111,21 @@ class Camera(Protocol):
     """Draws what the robot sees."""
 
     def render(self, robot: RobotState, street: Street) -> Frame: ...
+
+
+class Eyes(Camera, Protocol):
+    """A camera that also draws for humans."""
+
+    def picture(
+        self,
+        eye_m: ArrayLike,
+        target_m: ArrayLike,
+        street: Street,
+        robot: RobotState | None = None,
+        size: tuple[int, int] = (640, 480),
+        fov_deg: float = 60.0,
+    ) -> Frame:
+        """A view from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
 
 
 class Director(Protocol):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -18,7 +18,7 @@ from bridge.session import Session
 from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.loop import Parts
-from cosim.ports import Director, Policy
+from cosim.ports import CameraSpec, Director, Eyes, Policy
 from cosim.scenario import City, Place, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
 from physics.camera import BulletCamera
@@ -37,12 +37,13 @@ CORRIDOR_M = 40.0
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A scenario ready to run. area: where the robot may be, for the referee."""
+    """A scenario ready to run. area: where the robot may be, for the referee. eyes: makes further cameras."""
 
     parts: Parts
     area: WalkableArea
     clock: Clock
     renderer: str
+    eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
 
 
 @contextmanager
@@ -72,7 +73,8 @@ def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
         free = shapely.buffer(footing, -half_width_m)
         shapely.prepare(free)
         parts = Parts(world, crowd, director, policy, camera, Limits(), free)
-        yield Stage(parts, WalkableArea(walkable), clock, "bullet-tiny" if camera else "none")
+        renderer = "bullet-tiny" if camera else "none"
+        yield Stage(parts, WalkableArea(walkable), clock, renderer, lambda spec: BulletCamera(world, spec))
 
 
 def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:

@@ -1,0 +1,97 @@
+"""The command line for eyes: `cosim look`, `cosim film`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from cosim.errors import UsageError, unknown
+
+out = Console()
+err = Console(stderr=True)
+
+
+def look(
+    scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
+    at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,
+    view: Annotated[str, typer.Option(help="robot, follow (from behind) or above.")] = "robot",
+    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
+    suite: Annotated[
+        str, typer.Option(help="Where the scenario is: a suite or a suite's .json file.")
+    ] = "long-horizon",
+    policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
+) -> None:
+    """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
+    from scenarios.catalog import chosen
+    from scenarios.catalog import suite as shipped
+    from scenarios.look import VIEWS, look
+
+    picked = next((name for name in VIEWS if name == view), None)
+    if picked is None:
+        raise unknown("view", view, VIEWS)
+    pixels = size_of(size)
+    (one,) = chosen(shipped(suite), [scenario])
+    with err.status(f"driving to {at:g} s ..." if at else "setting up ..."):
+        image, time_s = look(one, policy, at, picked, pixels)
+    save(image, output)
+    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
+
+
+def film(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the film, an .mp4.")] = Path(
+        "film.mp4"
+    ),
+    start: Annotated[float, typer.Option("--from", min=0.0, help="First second.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", help="Last second; by default the end.")] = None,
+    size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
+    speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
+) -> None:
+    """Film an episode of a run: from behind the robot, with its own view, the map, events and failures."""
+    from cosim.runfolder import read_records
+    from scenarios.film import Cut, film
+
+    records = {record.scenario for record in read_records(folder)}
+    if episode not in records:
+        raise unknown(f"finished episode in {folder}", episode, records)
+    bars = Progress(
+        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=err
+    )
+    with bars:
+        task = bars.add_task(f"filming {episode}", total=None)
+        film(
+            folder,
+            episode,
+            output,
+            Cut(start, math.inf if end is None else end, size_of(size), speed),
+            lambda done, of: bars.update(task, completed=done, total=of),
+        )
+    out.print(f"Film: {output}", soft_wrap=True, highlight=False)
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height in "1280x720". Raises UsageError."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 4096 for part in parts):
+        raise UsageError(f"--size '{text}': give width x height in pixels, each from 16 to 4096, like 1280x720")
+    return int(parts[0]), int(parts[1])
+
+
+def save(image: object, path: Path) -> None:
+    """Write a picture. Raises UsageError when it cannot be written there."""
+    import cv2
+    import numpy as np
+
+    try:
+        written = cv2.imwrite(str(path), np.asarray(image)[..., ::-1])
+    except cv2.error as error:
+        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg") from error
+    if not written:
+        raise UsageError(f"{path}: the picture cannot be written there")

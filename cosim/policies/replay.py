@@ -1,0 +1,27 @@
+"""Replay: the commands of a recorded episode, tick by tick. With the same scenario it is the same episode again."""
+
+from __future__ import annotations
+
+from cosim.clock import Clock
+from cosim.errors import RunError
+from cosim.geometry import Floats
+from cosim.ports import Manifest, Observation
+from cosim.state import Command
+
+
+class Replay:
+    """Says at every tick what was recorded there. commands: (T, 2) m/s, rad/s. It sees nothing and asks nothing."""
+
+    def __init__(self, commands: Floats) -> None:
+        self.manifest = Manifest("replay", rate_hz=1.0 / Clock().tick_s, camera=None)
+        self._commands = commands
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        """Raises RunError beyond the end of the record."""
+        if observation.tick >= len(self._commands):
+            raise RunError(f"the record ends after {len(self._commands)} ticks, the episode goes on: not the same")
+        v_mps, w_radps = self._commands[observation.tick].tolist()
+        return Command(v_mps, w_radps)

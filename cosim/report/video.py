@@ -1,0 +1,66 @@
+"""Video: pictures become an .mp4 that plays everywhere (H.264, through PyAV)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import RunError
+
+MOST_PX = 4096
+"""Longest side of a video."""
+
+
+class Video:
+    """An .mp4 in the making. Use in a `with` block; the file appears at its end, and only if nothing went wrong.
+
+    size: width, height, both even; fps: pictures a second. Raises RunError when it cannot be written.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
+        if path.suffix != ".mp4":
+            raise RunError(f"{path}: a video's name ends in .mp4")
+        if any(side % 2 or not 16 <= side <= MOST_PX for side in size):
+            raise RunError(f"a video of {size[0]}x{size[1]} pixels: both sides must be even, from 16 to {MOST_PX}")
+        self._path, self._part = path, path.with_name(path.name + ".part")
+        try:
+            self._file = av.open(str(self._part), "w", format="mp4")
+        except OSError as error:
+            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+        self._stream = self._file.add_stream("libx264", rate=fps, options={"crf": "21", "preset": "veryfast"})
+        self._stream.width, self._stream.height = size
+        self._stream.pix_fmt = "yuv420p"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def add(self, rgb: NDArray[np.uint8]) -> None:
+        """The next picture, (height, width, 3)."""
+        frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(rgb), format="rgb24")
+        self._write(frame)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._write(None)
+                self._file.close()
+                self._part.replace(self._path)
+        except OSError as problem:
+            raise RunError(f"{self._path}: cannot be written: {problem.strerror}") from problem
+        finally:
+            self._file.close()
+            self._part.unlink(missing_ok=True)
+
+    def _write(self, frame: av.VideoFrame | None) -> None:
+        try:
+            for packet in self._stream.encode(frame):
+                self._file.mux(packet)
+        except OSError as error:
+            raise RunError(f"{self._path}: cannot be written: {error.strerror}") from error

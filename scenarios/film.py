@@ -1,0 +1,153 @@
+"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from the robot, from above.
+
+The replay is the same episode: at its end the state hash is held against the record's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+
+from cosim.clock import Clock
+from cosim.errors import RunError
+from cosim.geometry import Floats
+from cosim.policies.replay import Replay
+from cosim.ports import CameraSpec, Eyes
+from cosim.record import Log, Record, begun
+from cosim.referee import Verdict
+from cosim.report import hud
+from cosim.report.above import Image
+from cosim.report.minimap import Minimap
+from cosim.report.video import Video
+from cosim.scenario import Scenario, read_suite
+from cosim.state import RobotState, Street
+from cosim.step import Step
+from scenarios.assemble import place, staged
+from scenarios.look import behind
+from scenarios.run import drive
+
+EASE_S: Final = 0.5
+"""The follower's heading lags the robot's by about this much."""
+ROBOT_EYE: Final = CameraSpec(384, 288, 75.0)
+
+
+class Cut(NamedTuple):
+    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times real time."""
+
+    from_s: float = 0.0
+    to_s: float = math.inf
+    size: tuple[int, int] = (1280, 720)
+    speed: int = 1
+
+
+Tell = Callable[[int, int], None]
+"""Told the tick just drawn and the last one."""
+
+
+def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> None:
+    """Write the film of a finished episode. Raises RunError when there is none, or when the replay differs."""
+    scenario, record, log = _recorded(folder, scenario_id)
+    last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
+    if not 0.0 <= cut.from_s < Clock().time_s(last):
+        raise RunError(
+            f"'{scenario_id}' lasts {Clock().time_s(len(log)):.1f} s: nothing to film from {cut.from_s:g} s on"
+        )
+    _, street_map = place(scenario.place)
+    fps = round(1.0 / Clock().tick_s)
+    driver = Replay(log.command)
+    with ExitStack() as stack:
+        stage = stack.enter_context(staged(scenario, driver))
+        camera = stack.enter_context(stage.eyes(ROBOT_EYE))
+        video = stack.enter_context(Video(output, cut.size, fps))
+        reel = _Reel(scenario, record, Minimap(street_map, scenario), camera, video, cut, last, tell)
+        again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)
+    if again.state_hash != record.state_hash:
+        output.unlink(missing_ok=True)
+        raise RunError(
+            f"{folder}: '{scenario_id}' was not the same when it was replayed ({again.state_hash[:16]}, recorded "
+            f"{record.state_hash[:16]}): other versions? It was made with {record.versions}"
+        )
+
+
+def _recorded(folder: Path, scenario_id: str) -> tuple[Scenario, Record, Log]:
+    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
+    episode = folder / "episodes" / scenario_id
+    record = Record.load(episode / "record.json")
+    if record.status != "done":
+        raise RunError(f"{folder}: '{scenario_id}' {record.status}: there is nothing to film")
+    return scenarios[scenario_id], record, Log.load(episode / "trajectory.npz")
+
+
+class _Reel:
+    """Draws step after step. The follower's eye moves smoothly from picture to picture."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        record: Record,
+        minimap: Minimap,
+        camera: Eyes,
+        video: Video,
+        cut: Cut,
+        last: int,
+        tell: Tell,
+    ) -> None:
+        self._scenario, self._record, self._minimap = scenario, record, minimap
+        self._camera, self._video, self._cut, self._last, self._tell = camera, video, cut, last, tell
+        self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
+        self._triggered: set[str] = set()
+        self._caption, self._caption_until = ("", hud.INK), -1
+        self._heading: Floats | None = None
+
+    def take(self, step: Step, verdict: Verdict) -> None:
+        """One tick of the episode; drawn if it lies within the cut."""
+        self._note(step, verdict)
+        robot = step.motion.robot
+        ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
+        share = Clock().tick_s / EASE_S
+        self._heading = ahead if self._heading is None else (1.0 - share) * self._heading + share * ahead
+        first = Clock().ticks(self._cut.from_s)
+        if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
+            self._video.add(self._picture(step, robot, step.street_after))
+            self._tell(step.tick - first, self._last - first)
+
+    def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
+        width, height = self._cut.size
+        eye, target = behind(robot, self._heading)
+        image = np.ascontiguousarray(self._camera.picture(eye, target, street, robot, self._cut.size, 55.0).rgb)
+        small = (width * 3 // 10 // 2 * 2, width * 9 // 40 // 2 * 2)
+        seen = cv2.resize(self._camera.render(robot, street).rgb, small, interpolation=cv2.INTER_AREA)
+        hud.inset(image, seen.astype(np.uint8), (16, height - 60 - small[1]), "robot's camera")
+        side = width * 9 // 40
+        hud.inset(image, self._minimap.picture(robot, street, side), (width - 16 - side, 16))
+        time_s = Clock().time_s(step.tick)
+        counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
+        done = step.route_s_after_m / self._scenario.route_line.length_m
+        left = f"{self._scenario.id}  {self._record.policy}  {time_s:5.1f} s  {robot.v_mps:.1f} m/s"
+        hud.bar(image, left, f"route {100.0 * done:.0f} %   {counts}", done)
+        if step.tick < self._caption_until:
+            hud.caption(image, *self._caption)
+        return image
+
+    def _note(self, step: Step, verdict: Verdict) -> None:
+        """Count failures, and choose what is captioned."""
+        for event, state in zip(self._scenario.events, step.events.states, strict=True):
+            if state.phase == "acting" and event.id not in self._triggered:
+                self._triggered.add(event.id)
+                self._say(step.tick, event.kind.replace("_", " "), hud.INK)
+        if verdict.failure is not None:
+            kind = verdict.failure.kind
+            self._counts[kind] += 1
+            other = f" with {verdict.failure.other_kind}" if verdict.failure.other_kind else ""
+            self._say(step.tick, kind.replace("_", " ") + other, hud.BAD)
+        if verdict.ended == "goal":
+            self._say(step.tick, "goal", hud.GOOD)
+
+    def _say(self, tick: int, text: str, colour: tuple[int, int, int]) -> None:
+        self._caption, self._caption_until = (text, colour), tick + Clock().ticks(hud.CAPTION_S)

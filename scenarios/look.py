@@ -1,0 +1,78 @@
+"""One picture of a scenario: what the robot sees, or somebody behind or above it, at a moment of an episode."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, Literal
+
+import numpy as np
+
+from cosim.clock import Clock
+from cosim.geometry import Floats
+from cosim.policies.load import load_policy
+from cosim.ports import CameraSpec
+from cosim.record import begun
+from cosim.referee import Verdict
+from cosim.report.above import Image
+from cosim.scenario import Scenario
+from cosim.state import RobotState, Street
+from cosim.step import Step
+from scenarios.assemble import staged
+from scenarios.run import drive
+
+View = Literal["robot", "follow", "above"]
+VIEWS: Final[tuple[View, ...]] = ("robot", "follow", "above")
+BEHIND_M: Final = 4.6
+ABOVE_M: Final = 2.5
+AHEAD_M: Final = 3.0
+HIGH_M: Final = 28.0
+
+
+class _Reached(Exception):
+    """The moment that was asked for."""
+
+    def __init__(self, robot: RobotState, street: Street) -> None:
+        super().__init__()
+        self.robot, self.street = robot, street
+
+
+def look(scenario: Scenario, policy: str, at_s: float, view: View, size: tuple[int, int]) -> tuple[Image, float]:
+    """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if that comes first.
+
+    policy: who drives until then. size: width, height.
+    """
+    driver = load_policy(policy)
+    last = Clock().ticks(at_s)
+    spec = CameraSpec(*size) if driver.manifest.camera is None else CameraSpec(*size, driver.manifest.camera.fov_deg)
+    with staged(scenario, driver) as stage, stage.eyes(spec) as camera:
+        seen: list[Step] = []
+
+        def watch(step: Step, _: Verdict) -> None:
+            seen[:] = [step]
+            if step.tick >= last:
+                raise _Reached(step.robot, step.street)
+
+        try:
+            drive(begun(scenario, driver.manifest, ""), scenario, stage, watch)
+            robot, street = seen[0].motion.robot, seen[0].street_after
+        except _Reached as moment:
+            robot, street = moment.robot, moment.street
+        if view == "robot":
+            return camera.render(robot, street).rgb, Clock().time_s(street.tick)
+        eye, target = behind(robot) if view == "follow" else over(robot)
+        return camera.picture(eye, target, street, robot, size).rgb, Clock().time_s(street.tick)
+
+
+def behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
+    """(eye, target), (3,) metres: behind and above the robot, looking ahead. ahead: (2,), by default its heading."""
+    heading = robot.pose.heading_rad
+    way = np.array([math.cos(heading), math.sin(heading)]) if ahead is None else ahead / np.hypot(*ahead)
+    foot = robot.pose.xy
+    return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(foot + AHEAD_M * way, robot.z_m + 0.5)
+
+
+def over(robot: RobotState) -> tuple[Floats, Floats]:
+    """(eye, target), (3,) metres: from high behind the robot down on it."""
+    heading = robot.pose.heading_rad
+    way = np.array([math.cos(heading), math.sin(heading)])
+    return np.append(robot.pose.xy - 0.55 * HIGH_M * way, robot.z_m + HIGH_M), np.append(robot.pose.xy, robot.z_m)
