@@ -10,9 +10,43 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
+from cosim.errors import SpecError
 from cosim.events import EventQuery, EventReply
 from cosim.geometry import Polyline, Pose
 from cosim.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What a camera's optics and sensor do to a picture; the default does nothing.
+
+    k1, k2: radial terms of Brown's distortion, in units of the focal length; k1 < 0 is a barrel.
+    shutter_s: time the shutter is open, the source of motion blur; readout_s: from the first row to the last, the
+    source of a rolling shutter's skew. full_well_e: electrons of a white pixel, 0 for a sensor without noise;
+    read_noise_e: electrons of noise in the dark. auto_exposure_ev: stops by which metering on the picture itself may
+    brighten or darken it. vignette: 0 (none) to 1 (the natural fall of light, cos^4 of the angle off the axis).
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    shutter_s: float = 0.0
+    readout_s: float = 0.0
+    full_well_e: float = 0.0
+    read_noise_e: float = 0.0
+    auto_exposure_ev: float = 0.0
+    vignette: float = 0.0
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "k1": (-0.5, 0.5), "k2": (-0.5, 0.5), "shutter_s": (0.0, 0.1), "readout_s": (0.0, 0.1),
+            "full_well_e": (0.0, 1e6), "read_noise_e": (0.0, 1000.0), "auto_exposure_ev": (0.0, 4.0),
+            "vignette": (0.0, 1.0),
+        }  # fmt: skip
+        for field, (low, high) in ranges.items():
+            if not low <= getattr(self, field) <= high:
+                raise SpecError(f"lens {field} must be in [{low:g}, {high:g}], not {getattr(self, field)}")
+        if self.read_noise_e and not self.full_well_e:
+            raise SpecError("lens read_noise_e needs full_well_e, the electrons of a white pixel (10000 is usual)")
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +58,7 @@ class CameraSpec:
     fov_deg: float = 75.0
     mount_m: tuple[float, float, float] = (0.30, 0.0, 0.62)
     pitch_down_deg: float = 10.0
+    lens: Lens = Lens()
 
 
 @dataclass(frozen=True, slots=True)

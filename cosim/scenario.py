@@ -104,6 +104,36 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"crowd radius_m must be in [20, 500], not {self.radius_m}")
 
 
+class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+    """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
+
+    hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
+    leaves 5 % of a contrast (the meteorologists' visibility), None without fog. exposure_ev: stops brighter (+) or
+    darker (-) than the camera would choose. hdri: path of an equirectangular Radiance .hdr that replaces sky and sun.
+    """
+
+    hour: float = 13.0
+    day_of_year: int = 172
+    latitude_deg: float = 48.0
+    cloud_cover: float = 0.25
+    fog_m: float | None = None
+    exposure_ev: float = 0.0
+    shadows: bool = True
+    hdri: str = ""
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "hour": (0.0, 24.0), "day_of_year": (1, 366), "latitude_deg": (-90.0, 90.0), "cloud_cover": (0.0, 1.0),
+            "fog_m": (10.0, 50_000.0), "exposure_ev": (-4.0, 4.0),
+        }  # fmt: skip
+        for field, (low, high) in ranges.items():
+            value = getattr(self, field)
+            if value is not None and not low <= value <= high:
+                raise SpecError(f"light {field} must be in [{low:g}, {high:g}], not {value}")
+        if self.hdri and not self.hdri.lower().endswith(".hdr"):
+            raise SpecError(f"light hdri must be a Radiance .hdr file, not '{self.hdri}'")
+
+
 class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
 
@@ -122,6 +152,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     goal_radius_m: float = 1.0
     time_limit_s: float = 300.0
     ends_on_failure: bool = False
+    light: Light = Light()
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
@@ -168,7 +199,17 @@ class Suite(msgspec.Struct, frozen=True, kw_only=True):
 
 def content_hash(spec: msgspec.Struct) -> str:
     """SHA-256 of a spec's canonical JSON, 16 hex digits."""
-    return hashlib.sha256(msgspec.json.encode(spec, order="deterministic")).hexdigest()[:16]
+    return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
+
+
+def _canonical(spec: msgspec.Struct) -> bytes:
+    """JSON of a spec. The light of a scenario is left out where it is the default, so that a spec that does not
+    speak of light has the bytes and the hash it had before there was light."""
+    tree = msgspec.to_builtins(spec, order="deterministic")
+    for scenario in tree.get("scenarios", [tree]):
+        if scenario.get("light") == {}:
+            del scenario["light"]
+    return msgspec.json.encode(tree)
 
 
 def read_suite(path: Path) -> Suite:
@@ -184,5 +225,5 @@ def read_suite(path: Path) -> Suite:
 def write_suite(suite: Suite, path: Path) -> None:
     """Write a suite as readable JSON: one scenario a line."""
     head = msgspec.json.encode({"name": suite.name, "version": suite.version, "description": suite.description})
-    rows = b",\n".join(msgspec.json.encode(s, order="deterministic") for s in suite.scenarios)
+    rows = b",\n".join(_canonical(s) for s in suite.scenarios)
     path.write_bytes(head[:-1] + b',"scenarios":[\n' + rows + b"\n]}\n")

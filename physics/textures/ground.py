@@ -1,0 +1,238 @@
+"""Ground: asphalt, slabs, pavers, brick, setts, curbs, grass, gravel, tactile paving, paint; and what lies where."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from physics.textures.bonds import Bond, basket, courses, herringbone, random_courses
+from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
+from physics.textures.noise import Noise, blurred, cells, step
+from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
+
+_GREY: Final = ((0.62, 0.61, 0.59), (0.60, 0.59, 0.56), (0.64, 0.63, 0.61))
+_RED: Final = ((0.58, 0.36, 0.29), (0.54, 0.33, 0.27), (0.62, 0.40, 0.31), (0.50, 0.31, 0.27))
+_SAND: Final = (0.52, 0.49, 0.44)
+_DARK: Final = (0.36, 0.35, 0.34)
+
+
+@lru_cache(maxsize=4)
+def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
+    """Every layer of ground. size_px: 256 suits a laptop."""
+    return stacked(GROUND, size_px, seed)
+
+
+def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False) -> Generator:
+    def make(noise: Noise) -> Picture:
+        chips = noise.grain(0.6)
+        colour = (tone, tone, 1.02 * tone)
+        rgb = plain(noise, colour, 0.012, 0.0, 4)
+        light = step(0.9, 2.2, chips) - 0.8 * step(0.7, 2.0, -chips)
+        rgb = rgb + np.float32(stone) * (light + 0.35 * noise.grain())[..., None]
+        if patches:
+            lid = Bond(np.zeros((noise.size,) * 2, np.int32), _patch(noise), 1)
+            inside = step(0.0, 0.008, lid.edge)
+            fresh = plain(noise, (tone - 0.06,) * 3, 0.008, 0.02)
+            seam = 1.0 - step(0.0, 0.012, np.abs(lid.edge))
+            rgb = shaded(mixed(rgb, fresh, inside), 1.0 - 0.30 * seam)
+        if worn:
+            split = cracks(noise, cells(noise, 4), 0.004)
+            rgb = shaded(rgb, 1.0 - 0.55 * np.float32(worn) * split)
+            rgb = stained(rgb, noise, 0.10 * worn)
+        return Picture(rgb)
+
+    return make
+
+
+def _patch(noise: Noise) -> np.ndarray:
+    """Signed distance to a repaired rectangle's outline, positive inside, as a share of the side."""
+    at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size
+    x, y = np.meshgrid(at, at)
+    dx, dy = 0.21 - np.abs(x - 0.47), 0.30 - np.abs(y - 0.52)
+    return np.asarray(np.minimum(dx, dy) + 0.004 * noise.clouds(8), dtype=np.float32)
+
+
+def _stones(side_m: float, bond: Sequence[object], colours: Sequence[Colour], joint: Colour, **look: float) -> Recipe:
+    """A laid surface: `bond` is a function of bonds and its arguments after size and side."""
+    lay, *arguments = bond
+
+    def make(noise: Noise) -> Picture:
+        whole = laid(noise, lay(noise.size, side_m, *arguments), side_m, colours, joint, **look)  # type: ignore[operator]
+        return Picture(stained(whole.rgb, noise, 0.08), whole.alpha)
+
+    return Recipe(side_m, make)
+
+
+def _setts(noise: Noise) -> Picture:
+    bond = random_courses(noise.rng, noise.size, 1.6, [0.1] * 16, (0.09, 0.15))
+    return laid(
+        noise, bond, 1.6, ((0.50, 0.49, 0.48), (0.44, 0.43, 0.43), (0.55, 0.53, 0.51)), _DARK,
+        joint_m=0.013, bevel_m=0.016, spread=0.09, wobble_m=0.004, grain=0.04,
+    )  # fmt: skip
+
+
+def _cobbles(noise: Noise) -> Picture:
+    bond = bond_of(cells(noise, 14, 0.55), 1.6)
+    return laid(
+        noise, bond, 1.6, ((0.50, 0.48, 0.45), (0.44, 0.43, 0.42), (0.56, 0.52, 0.47)), (0.34, 0.32, 0.29),
+        joint_m=0.016, bevel_m=0.022, spread=0.10, wobble_m=0.003, grain=0.04,
+    )  # fmt: skip
+
+
+def _granite(noise: Noise) -> Picture:
+    bond = courses(noise.size, 1.0, 1, [1.0], [0.0])
+    speck = noise.grain(0.7)
+    whole = laid(noise, bond, 1.0, ((0.63, 0.62, 0.61),), _DARK, joint_m=0.006, wobble_m=0.0, grain=0.03)
+    return Picture(whole.rgb + 0.05 * (step(0.8, 1.6, speck) - 1.3 * step(1.0, 1.8, -speck))[..., None])
+
+
+def _grass(dry: float, worn: float = 0.0) -> Generator:
+    def make(noise: Noise) -> Picture:
+        blades = blurred(noise.grain(), 0.5) * 0.7 + noise.streaks(128, 8) * 0.6 + noise.streaks(128, 4, 1) * 0.5
+        tuft = noise.clouds(16)
+        green = mixed((0.25, 0.35, 0.15), (0.38, 0.46, 0.21), step(-1.5, 1.6, blades + 0.6 * tuft))
+        straw = (0.52, 0.48, 0.29)
+        rgb = mixed(green, straw, np.float32(dry) * step(-0.5, 2.2, noise.clouds(8) + 0.5 * blades))
+        if worn:
+            bare = np.float32(worn) * step(0.5, 1.6, noise.clouds(4) + 0.25 * blades)
+            rgb = mixed(rgb, plain(noise, (0.42, 0.35, 0.27), 0.02, 0.04), bare)
+        return Picture(shaded(rgb, 1.0 + 0.06 * noise.clouds(4) + 0.05 * blades))
+
+    return make
+
+
+def _earth(noise: Noise) -> Picture:
+    rgb = stained(plain(noise, (0.43, 0.36, 0.28), 0.03, 0.03, 8), noise, 0.15, 8)
+    pebbles = cells(noise, 40, 0.9)
+    some = (noise.rng.random(pebbles.n) < 0.2).astype(np.float32)[pebbles.id]
+    return Picture(mixed(rgb, (0.55, 0.50, 0.43), 0.7 * some * step(0.003, 0.008, pebbles.edge)))
+
+
+def _gravel(noise: Noise) -> Picture:
+    bond = bond_of(cells(noise, 64, 0.9), 1.2)
+    colours = ((0.58, 0.55, 0.50), (0.50, 0.47, 0.43), (0.64, 0.61, 0.56), (0.45, 0.43, 0.41))
+    return laid(
+        noise, bond, 1.2, colours, (0.33, 0.30, 0.27), joint_m=0.003, bevel_m=0.007, spread=0.10, joint_tint=0.8
+    )
+
+
+def _tactile(bars: bool) -> Generator:
+    """Slabs of 0.3 m with domes 60 mm apart, or bars 75 mm apart (ISO 23599)."""
+
+    def make(noise: Noise) -> Picture:
+        at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 0.6
+        x, y = np.meshgrid(at, at)
+        if bars:
+            inset = np.maximum(np.abs((y % 0.3) - 0.15) - 0.122, 0.0)
+            distance = np.hypot(np.abs((x % 0.075) - 0.0375), inset)
+            bump = 1.0 - step(0.011, 0.017, distance)
+        else:
+            bump = 1.0 - step(0.009, 0.0165, np.hypot((x % 0.06) - 0.03, (y % 0.06) - 0.03))
+        colour = ((0.74, 0.66, 0.44), (0.72, 0.64, 0.42), (0.76, 0.68, 0.47))
+        slab = laid(noise, courses(noise.size, 0.6, 2, [0.3], [0.0]), 0.6, colour, _DARK, joint_m=0.005, spread=0.02)
+        soft = blurred(bump, 0.004 / 0.6 * noise.size)
+        rgb = shaded(slab.rgb, relief(blurred(bump, 1.2), 0.30) * (1.0 - 0.18 * np.clip(soft - bump, 0.0, 1.0)))
+        return Picture(shaded(rgb, 1.0 + 0.05 * bump), slab.alpha)
+
+    return make
+
+
+def _paint(worn: float) -> Generator:
+    """Road paint: it takes the tint; where it is worn off the asphalt below keeps its colour."""
+
+    def make(noise: Noise) -> Picture:
+        below = _asphalt(0.05)(noise).rgb
+        paint = plain(noise, (0.86, 0.86, 0.84), 0.015, 0.018)
+        lost = step(1.9 - 1.3 * worn, 3.0 - 1.2 * worn, noise.clouds(8) + 0.6 * noise.grain(0.6))
+        lost = np.maximum(lost, worn * cracks(noise, cells(noise, 6), 0.004))
+        return Picture(mixed(paint, below, 0.9 * lost), 1.0 - 0.9 * lost)
+
+    return make
+
+
+def _cast(noise: Noise) -> Picture:
+    """Cast concrete with a joint every 1.5 m."""
+    bond = courses(noise.size, 3.0, 2, [1.5], [0.0])
+    whole = laid(noise, bond, 3.0, _GREY, (0.40, 0.39, 0.38), joint_m=0.012, spread=0.015, wobble_m=0.0, grain=0.016)
+    pores = step(1.9, 2.6, noise.grain(0.5))
+    rgb = stained(shaded(whole.rgb, 1.0 - 0.16 * pores), noise, 0.10, 4)
+    return Picture(shaded(rgb, 1.0 - 0.45 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha)
+
+
+GROUND: Final[Mapping[str, Recipe]] = {
+    "asphalt": Recipe(3.0, _asphalt(0.050)),
+    "asphalt-worn": Recipe(4.0, _asphalt(0.055, 0.37, worn=1.0)),
+    "asphalt-patched": Recipe(4.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
+    "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
+    "concrete-cast": Recipe(3.0, _cast),
+    "slabs-square": _stones(2.0, (courses, 5, [0.4], [0.0]), _GREY, _DARK, joint_m=0.007, spread=0.035),
+    "slabs-running": _stones(2.4, (courses, 6, [0.6], [0.0, 0.5]), _GREY, _DARK, joint_m=0.007, spread=0.035),
+    "slabs-mixed": _stones(
+        2.4, (courses, 6, [0.6, 0.4, 0.2], [0.0, 0.39, 0.81]), _GREY, _DARK, joint_m=0.007, spread=0.045
+    ),
+    "slabs-worn": _stones(
+        2.0, (courses, 4, [0.5], [0.0]), (*_GREY, (0.54, 0.53, 0.50)), _SAND, joint_m=0.010, spread=0.06, clouds=0.05
+    ),
+    "pavers-running": _stones(1.6, (courses, 16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-herringbone": _stones(1.6, (herringbone, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-basket": _stones(1.6, (basket, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-mixed": _stones(
+        1.8, (courses, 12, [0.2, 0.15, 0.25], [0.0, 0.45, 0.2]), (*_GREY, (0.52, 0.50, 0.48)), _DARK, spread=0.06
+    ),
+    "brick-running": _stones(1.68, (courses, 16, [0.21], [0.0, 0.5]), _RED, _SAND, joint_m=0.007, spread=0.07),
+    "brick-herringbone": _stones(1.68, (herringbone, 0.105), _RED, _SAND, joint_m=0.007, spread=0.07),
+    "brick-basket": _stones(1.68, (basket, 0.105), _RED, _SAND, joint_m=0.007, spread=0.07),
+    "setts": Recipe(1.6, _setts),
+    "cobbles": Recipe(1.6, _cobbles),
+    "granite": Recipe(1.0, _granite),
+    "grass": Recipe(2.0, _grass(0.25)),
+    "grass-dry": Recipe(2.0, _grass(0.85)),
+    "grass-worn": Recipe(2.0, _grass(0.5, 0.9)),
+    "earth": Recipe(2.0, _earth),
+    "gravel": Recipe(1.2, _gravel),
+    "tactile-domes": Recipe(0.6, _tactile(bars=False)),
+    "tactile-bars": Recipe(0.6, _tactile(bars=True)),
+    "paint": Recipe(2.0, _paint(0.35)),
+    "paint-worn": Recipe(2.0, _paint(1.0)),
+}
+
+SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
+    "road": ("asphalt", "asphalt-worn", "asphalt-patched"),
+    "crossing": ("asphalt", "asphalt-worn"),
+    "stripe": ("paint", "paint-worn"),
+    "paint": ("paint", "paint-worn"),
+    "sidewalk": ("concrete-cast", "slabs-square", "slabs-running"),
+    "ramp": ("concrete-cast",),
+    "curb": ("granite",),
+    "gutter": ("concrete-cast", "setts"),
+    "tactile": ("tactile-domes",),
+    "guide": ("tactile-bars",),
+    "verge": ("grass", "grass-dry", "grass-worn"),
+    "ground": ("grass", "grass-dry"),
+    "concrete": ("slabs-square", "slabs-running", "slabs-mixed", "slabs-worn", "concrete-cast"),
+    "pavers": ("pavers-running", "pavers-herringbone", "pavers-basket", "pavers-mixed"),
+    "brick": ("brick-running", "brick-herringbone", "brick-basket"),
+    "asphalt": ("asphalt-fine", "asphalt", "asphalt-patched"),
+    "setts": ("setts", "cobbles"),
+    "grass": ("grass", "grass-dry", "grass-worn"),
+    "gravel": ("gravel",),
+    "earth": ("earth", "gravel"),
+}
+"""Layers that a kind of ground (physics.tiles) or a material (physics.materials) may show."""
+
+
+def layer_of(surface: str, seed: int = 0) -> str:
+    """The layer of a part of a tile, drawn from its own name and a seed: "sidewalk:brick:2" is one of brick.
+
+    Ground of a kind that the table does not know is asphalt.
+    """
+    kind, _, rest = surface.partition(":")
+    material = rest.partition(":")[0]
+    choice = SURFACE_LAYERS.get(material) or SURFACE_LAYERS.get(kind) or ("asphalt",)
+    if kind == "road" and material == "brick":
+        choice = ("setts", "brick-running", "brick-herringbone")
+    return choice[zlib.crc32(f"{surface}:{seed}".encode()) % len(choice)]

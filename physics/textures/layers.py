@@ -1,0 +1,126 @@
+"""Layers: square textures of one size, stacked as a texture array, and how a colour is put on them.
+
+A texel's albedo, everything linear (decoded from sRGB; filtering and mip-maps too are linear, GL_SRGB8_ALPHA8):
+
+    surface (ground, wall, prop):  mix(rgb, rgb / mean * tint, alpha)      without a tint of its own: rgb
+    facade over a wall:            rgb + alpha * wall                       rgb is premultiplied
+
+so that alpha is the share of the tint in a surface (mortar keeps its own colour), and the share of the wall behind in
+a facade.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.errors import SpecError, UsageError, unknown
+from physics.textures.noise import Field, Noise
+
+Rgb = NDArray[np.floating[Any]]
+"""(S, S, 3) sRGB, 0 to 1."""
+Colour = tuple[float, float, float]
+
+SIZES: Final = (256, 512, 1024)
+
+
+@dataclass(frozen=True, slots=True)
+class Layers:
+    """Textures of one size S. names: L, unique; rgba: (L, S, S, 4) uint8, rows down the picture, colours sRGB;
+    metres: (L, 2) width and height of a texture in the world; mean: (L, 3) linear mean colour;
+    finish: (L, S, S, 2) uint8, gloss (how much of a mirror: panes) and glow (light of its own at night).
+    Arrays are write-protected.
+    """
+
+    names: tuple[str, ...]
+    rgba: NDArray[np.uint8]
+    metres: NDArray[np.float32]
+    mean: NDArray[np.float32]
+    finish: NDArray[np.uint8] | None = None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def index(self, name: str) -> int:
+        """The number of a layer. Raises UsageError that lists the names."""
+        try:
+            return self.names.index(name)
+        except ValueError:
+            raise unknown("texture layer", name, self.names) from None
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """One layer before it is stacked. rgb: (S, S, 3) sRGB; alpha: (S, S) or None for 1; finish: (S, S, 2)."""
+
+    rgb: Rgb
+    alpha: Field | None = None
+    finish: Rgb | None = None
+
+
+Generator = Callable[[Noise], Picture]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """How a layer is made, and what it shows in metres: the side of a square, or width and height."""
+
+    metres: float | tuple[float, float]
+    make: Generator
+
+
+def stacked(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
+    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one changes no other."""
+    if size_px not in SIZES:
+        raise SpecError(f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}")
+    rgba = np.empty((len(recipes), size_px, size_px, 4), np.uint8)
+    mean = np.empty((len(recipes), 3), np.float32)
+    finish = None
+    for k, (name, recipe) in enumerate(recipes.items()):
+        picture = recipe.make(Noise(size_px, (seed, *name.encode())))
+        rgba[k, ..., :3] = np.clip(picture.rgb, 0.0, 1.0) * 255.0 + 0.5
+        rgba[k, ..., 3] = 255 if picture.alpha is None else np.clip(picture.alpha, 0.0, 1.0) * 255.0 + 0.5
+        mean[k] = mean_linear(rgba[k, ..., :3])
+        if picture.finish is not None:
+            finish = np.zeros((len(recipes), size_px, size_px, 2), np.uint8) if finish is None else finish
+            finish[k] = np.clip(picture.finish, 0.0, 1.0) * 255.0 + 0.5
+    metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
+    for array in (rgba, metres, mean, finish):
+        if array is not None:
+            array.flags.writeable = False
+    return Layers(tuple(recipes), rgba, metres, mean, finish)
+
+
+def joined(*stacks: Layers) -> Layers:
+    """Several stacks of one size as one; names must differ, finishes are not kept."""
+    names = tuple(name for stack in stacks for name in stack.names)
+    if len(set(names)) != len(names) or len({stack.rgba.shape[1] for stack in stacks}) != 1:
+        raise UsageError("stacks of textures are joined when they are of one size and share no name")
+    arrays = (np.concatenate([getattr(stack, field) for stack in stacks]) for field in ("rgba", "metres", "mean"))
+    return Layers(names, *arrays)
+
+
+def linear(srgb: NDArray[np.floating] | Colour) -> NDArray[np.float32]:
+    """sRGB values 0 to 1, decoded (IEC 61966-2-1)."""
+    s = np.asarray(srgb, dtype=np.float32)
+    return np.where(s <= 0.04045, s / 12.92, ((np.maximum(s, 0.0) + 0.055) / 1.055) ** 2.4).astype(np.float32)
+
+
+def encoded(value: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Linear values 0 to 1 as sRGB (IEC 61966-2-1)."""
+    v = np.clip(np.asarray(value, dtype=np.float32), 0.0, 1.0)
+    return np.where(v <= 0.0031308, 12.92 * v, 1.055 * v ** (1 / 2.4) - 0.055).astype(np.float32)
+
+
+LINEAR: Final = linear(np.arange(256) / 255.0)
+"""(256,) decoded values of sRGB bytes."""
+
+
+def mean_linear(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """(3,) linear mean of an sRGB picture (..., 3)."""
+    counts = [np.bincount(rgb[..., c].ravel(), minlength=256) for c in range(3)]
+    return np.array([LINEAR @ count / count.sum() for count in counts], dtype=np.float32)

@@ -1,0 +1,89 @@
+"""What surfaces have in common: a colour that varies a little, stones in joints, grain, dirt."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from physics.textures.bonds import Bond
+from physics.textures.layers import Colour, Picture, Rgb
+from physics.textures.noise import Cells, Field, Noise, blurred, step
+
+
+def plain(noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 4) -> Rgb:
+    """One colour with large soft patches and fine grain, both given as deviations of sRGB."""
+    tone = np.float32(clouds) * noise.clouds(cells) + np.float32(grain) * noise.grain()
+    return np.asarray(
+        np.asarray(colour, dtype=np.float32) * (1.0 + tone[..., None] / max(np.mean(colour), 0.1)), dtype=np.float32
+    )
+
+
+def mixed(one: Rgb | Colour, two: Rgb | Colour, share: Field) -> Rgb:
+    """`one` where share is 0, `two` where it is 1."""
+    a, b = np.asarray(one, dtype=np.float32), np.asarray(two, dtype=np.float32)
+    return np.asarray(a + (b - a) * share[..., None], dtype=np.float32)
+
+
+def relief(height: Field, strength: float) -> Field:
+    """Light and shade of a height field under a high light from the upper left: factors around 1."""
+    slope = np.roll(height, (-1, -1), (0, 1)) - np.roll(height, (1, 1), (0, 1))
+    return np.asarray(1.0 + np.clip(np.float32(strength) * slope, -0.35, 0.35), dtype=np.float32)
+
+
+def laid(
+    noise: Noise,
+    bond: Bond,
+    side_m: float,
+    colours: Sequence[Colour],
+    joint: Colour,
+    *,
+    joint_m: float = 0.006,
+    bevel_m: float = 0.004,
+    spread: float = 0.05,
+    wobble_m: float = 0.0015,
+    grain: float = 0.025,
+    clouds: float = 0.02,
+    joint_tint: float = 0.35,
+) -> Picture:
+    """Stones in joints. colours: drawn for each unit; spread: deviation of brightness from unit to unit;
+    wobble_m: how uneven edges are; joint_tint: share of the tint in the joints."""
+    pixel_m = side_m / noise.size
+    width = max(joint_m, 0.9 * pixel_m)
+    edge = bond.edge + np.float32(wobble_m) * noise.clouds(32) if wobble_m else bond.edge
+    soft = max(bevel_m, pixel_m)
+    face = step(0.5 * width - 0.5 * soft, 0.5 * width + 0.5 * soft, edge)
+    # A joint thinner than a pixel is drawn a pixel wide and paler.
+    face = 1.0 - (1.0 - face) * np.float32(min(1.0, joint_m / width + 0.25))
+    palette = np.asarray(colours, dtype=np.float32)[noise.rng.integers(len(colours), size=bond.n)]
+    palette *= (1.0 + noise.rng.normal(0.0, spread, (bond.n, 1))).astype(np.float32)
+    tone = 1.0 + np.float32(clouds) * noise.clouds(4) + np.float32(grain) * noise.grain()
+    worn = step(0.0, 4.0 * soft + 0.004, edge - np.float32(0.5 * width))
+    tone *= 0.90 + 0.10 * worn
+    tone *= relief(blurred(face, 0.7), 0.10)
+    stone = palette[bond.id] * tone[..., None]
+    bed = plain(noise, joint, 0.02, grain)
+    return Picture(mixed(bed, stone, face), np.float32(joint_tint) + np.float32(1.0 - joint_tint) * face)
+
+
+def bond_of(found: Cells, side_m: float) -> Bond:
+    """Scattered cells as a bond."""
+    return Bond(found.id, found.edge * np.float32(side_m), found.n)
+
+
+def cracks(noise: Noise, found: Cells, width: float, wiggle: float = 0.012) -> Field:
+    """Lines along some borders of cells, `width` of the side wide: 0 none, 1 in a crack."""
+    edge = noise.warped(found.edge, wiggle, 8)
+    line = 1.0 - step(0.25 * width, width, edge)
+    return np.asarray(line * step(0.2, 0.9, noise.clouds(4)), dtype=np.float32)
+
+
+def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 4) -> Rgb:
+    """Darker where water and dirt have been."""
+    dirt = step(0.4, 2.0, noise.clouds(cells))
+    return np.asarray(rgb * (1.0 - np.float32(depth) * dirt[..., None]), dtype=np.float32)
+
+
+def shaded(rgb: Rgb, factor: Field) -> Rgb:
+    """Brighter or darker by (S, S) factors."""
+    return np.asarray(rgb * factor[..., None], dtype=np.float32)
