@@ -34,6 +34,7 @@ from scenarios.run import drive
 
 EASE_S: Final = 0.5
 """The follower's heading lags the robot's by about this much."""
+SMALLEST_PX: Final = (320, 180)
 ROBOT_EYE: Final = CameraSpec(384, 288, 75.0)
 
 
@@ -58,13 +59,16 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
         raise RunError(
             f"'{scenario_id}' lasts {Clock().time_s(len(log)):.1f} s: nothing to film from {cut.from_s:g} s on"
         )
+    if cut.size[0] < SMALLEST_PX[0] or cut.size[1] < SMALLEST_PX[1]:
+        least = "x".join(map(str, SMALLEST_PX))
+        raise RunError(f"a film of {cut.size[0]}x{cut.size[1]} pixels: below {least} nothing can be read")
     _, street_map = place(scenario.place)
     fps = round(1.0 / Clock().tick_s)
     driver = Replay(log.command)
     with ExitStack() as stack:
+        video = stack.enter_context(Video(output, cut.size, fps))
         stage = stack.enter_context(staged(scenario, driver))
         camera = stack.enter_context(stage.eyes(ROBOT_EYE))
-        video = stack.enter_context(Video(output, cut.size, fps))
         reel = _Reel(scenario, record, Minimap(street_map, scenario), camera, video, cut, last, tell)
         again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)
     if again.state_hash != record.state_hash:

@@ -29,6 +29,7 @@ class Video:
             raise RunError(f"a video of {size[0]}x{size[1]} pixels: both sides must be even, from 16 to {MOST_PX}")
         self._path, self._part = path, path.with_name(path.name + ".part")
         try:
+            self._part.touch()
             self._file = av.open(str(self._part), "w", format="mp4")
         except OSError as error:
             raise RunError(f"{path}: cannot be written: {error.strerror}") from error

@@ -1,0 +1,126 @@
+"""`cosim look` and `cosim film` as a user runs them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import av
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.errors import RunError
+from cosim.policies.replay import Replay
+from cosim.ports import Observation
+from cosim.report.video import Video
+from cosim.scenario import City, CrowdSpec, Suite, write_suite
+from cosim.walks import WalkGraph
+
+pytestmark = pytest.mark.engine
+
+
+def cosim(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "cosim", *words]
+    environment = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a suite of one short scenario, and a run of it."""
+    from scenarios.assemble import place
+    from scenarios.long_horizon import build
+
+    folder = tmp_path_factory.mktemp("desk")
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
+    short = msgspec.structs.replace(
+        whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=4.0, robot="courier"
+    )
+    write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
+    done = cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_film_shows_the_seconds_asked_for(desk: Path) -> None:
+    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play."""
+    words = ("film", "run", "t-0", "--from", "1", "--to", "2", "--size", "320x180", "-o", "film.mp4")
+    done = cosim(*words, cwd=desk)
+    assert done.returncode == 0, done.stderr
+    with av.open(str(desk / "film.mp4")) as film:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
+    assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
+    assert not list(desk.glob("*.part"))
+
+
+def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
+    """A film of another episode than the recorded one is no film of it: an error, and no file."""
+    path = desk / "run" / "episodes" / "t-0" / "record.json"
+    kept = path.read_bytes()
+    record = json.loads(kept)
+    path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
+    try:
+        done = cosim("film", "run", "t-0", "--to", "0.2", "--size", "320x180", "-o", "wrong.mp4", cwd=desk)
+    finally:
+        path.write_bytes(kept)
+    assert done.returncode == 1 and "not the same when it was replayed" in done.stderr
+    assert not list(desk.glob("wrong*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("film", "run", "t-9"), "unknown finished episode"),
+        (("film", "run", "t-0", "--from", "99"), "nothing to film"),
+        (("film", "run", "t-0", "--size", "wide"), "--size 'wide'"),
+        (("film", "run", "t-0", "--size", "321x181"), "both sides must be even"),
+        (("film", "run", "t-0", "--size", "64x64"), "nothing can be read"),
+        (("film", "run", "t-0", "-o", "film.gif"), "ends in .mp4"),
+        (("film", "run", "t-0", "-o", "nowhere/film.mp4"), "cannot be written"),
+        (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
+        (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
+    ],
+)
+def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, words: tuple[str, ...], told: str) -> None:
+    """Exit code 1 or 2, one message, no traceback."""
+    done = cosim(*words, cwd=desk)
+    assert done.returncode in (1, 2) and told in done.stderr and "Traceback" not in done.stderr
+
+
+def test_a_look_is_a_picture_of_its_moment(desk: Path) -> None:
+    """From the robot or from above: a picture of the size asked for, with something in it."""
+    seen = {}
+    for name, words in {
+        "start": ("--at", "0"),
+        "above": ("--at", "1", "--view", "above"),
+    }.items():
+        done = cosim("look", "t-0", "--suite", "tiny.json", *words, "--size", "160x90", "-o", f"{name}.png", cwd=desk)
+        assert done.returncode == 0, done.stderr
+        seen[name] = cv2.imread(str(desk / f"{name}.png"))
+        assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
+    assert (seen["start"] != seen["above"]).mean() > 0.5
+
+
+def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
+    """An exception while it is made: no file, no part of one."""
+    with pytest.raises(KeyError), Video(tmp_path / "film.mp4", (64, 48), 20) as video:
+        video.add(np.zeros((48, 64, 3), dtype=np.uint8))
+        raise KeyError
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_replay_ends_with_its_record() -> None:
+    """Beyond the last recorded tick there is nothing to say."""
+    replay = Replay(np.array([[1.0, 0.2]]))
+    assert replay.act(Observation(0, 0.0, None, 0.0, 0.0)).w_radps == 0.2
+    with pytest.raises(RunError, match="ends after 1 ticks"):
+        replay.act(Observation(1, 0.05, None, 0.0, 0.0))
