@@ -12,7 +12,7 @@ from physics.gl.shading import programs, put
 _VERTEX: Final = """
 out vec2 spot;
 void main() {
-    spot = vec2(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0);
+    spot = vec2(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0);
     gl_Position = vec4(spot, 1.0, 1.0);
 }
 """

@@ -20,11 +20,14 @@ from physics.gl.backdrop import Backdrop
 from physics.gl.context import context
 from physics.gl.scene import Scene
 from physics.gl.shading import DAY, Lighting, SceneBlock, anchor_of, camera_matrix
+from physics.gl.shadows import ShadowMaps, middle_of, shadow_matrix
 from physics.gl.targets import Target
 from physics.view import Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
 
 _TARGETS_MAX: Final = 4
+_TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
+"""From clip space to the space of a texture."""
 
 
 class GlCamera:
@@ -42,6 +45,7 @@ class GlCamera:
             world, shadows = self._world, self._light.shadows > 0.0
             with context() as gl:
                 self._scene = Scene(gl, world.ground, world.barriers, world.model, shadows)
+                self._shadows = ShadowMaps(gl) if shadows else None
                 self._block = SceneBlock(gl)
                 self._backdrop = Backdrop(gl)
             self._context = gl
@@ -57,6 +61,8 @@ class GlCamera:
         if self._context is not None:
             with self._context:
                 self._scene.release()
+                if self._shadows is not None:
+                    self._shadows.release()
                 self._block.release()
                 self._backdrop.release()
                 while self._targets:
@@ -65,7 +71,8 @@ class GlCamera:
 
     def render(self, robot: RobotState, street: Street) -> Frame:
         """What the robot sees from its mount; it leans with the ground, and its own body is not in the picture."""
-        return self._drawn(robot_shot(self._world.ground, self._world.model, self.spec, robot), street, None)
+        taken = robot_shot(self._world.ground, self._world.model, self.spec, robot)
+        return self._drawn(taken, street, robot, body=False)
 
     def picture(
         self,
@@ -77,16 +84,23 @@ class GlCamera:
         fov_deg: float = 60.0,
     ) -> Frame:
         """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
-        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot)
+        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot, body=True)
 
-    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None) -> Frame:
+    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
         with self._context as gl:
             target = self._target(taken.size)
             anchor = anchor_of(taken.eye_m)
-            self._scene.arrange(taken, anchor, street, robot)
-            self._block.write(camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
+            self._scene.arrange(taken, anchor, street, robot, body)
+            from_sun = np.eye(4)
+            if self._shadows is not None:
+                middle = middle_of(taken.eye_m)
+                from_sun = shadow_matrix(middle, anchor, self._light.to_sun)
+                self._block.write(from_sun, from_sun, taken, anchor, self._light)
+                self._shadows.draw(middle, anchor, self._light, self._scene.draw)
+                self._shadows.bind()
+            self._block.write(camera_matrix(taken, anchor), _TO_TEXTURE @ from_sun, taken, anchor, self._light)
             target.frame.use()
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"  # the picture is drawn upside down, to be read top first

@@ -6,7 +6,7 @@ forms lie in one buffer, and the counts of a draw lie in another (multi-draw ind
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import Final, NamedTuple
 
 import moderngl
@@ -72,15 +72,10 @@ class Forms:
         self._held = -1
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
 
-    def __contains__(self, key: Hashable) -> bool:
-        return key in self._ids
-
-    def id(self, key: Hashable, parts: Sequence[Coat] | None = None) -> int:
-        """The number of a form; `parts` are needed when it is new."""
+    def id(self, key: Hashable, parts: Callable[[], Sequence[Coat]]) -> int:
+        """The number of a form; `parts` makes it when its key is new."""
         if key not in self._ids:
-            if parts is None:
-                raise KeyError(key)
-            self._add(key, parts)
+            self._add(key, parts())
         return self._ids[key]
 
     def _add(self, key: Hashable, parts: Sequence[Coat]) -> None:

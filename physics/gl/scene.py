@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 import moderngl
@@ -21,8 +22,10 @@ from physics.gl.corners import Rows
 from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
 from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
+from physics.gl.shadows import REACH_M, STEP_M, middle_of
 from physics.gl.tiles import TileBuffers, tile_programs
 from physics.ground import Ground
+from physics.mesh import Mesh
 from physics.robots import RobotModel
 from physics.tiles import Key, distance_to, keys_within
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
@@ -56,18 +59,25 @@ class Scene:
     ) -> None:
         self._context, self._ground, self._model = context, ground, model
         self._tiles: dict[Key, _Tile] = {}
+        self._shadows = shadows
         self._shaders = tile_programs(context, shadows)
         self._forms = Forms(context, shadows)
         self._seen = Things(context, self._forms, ("colour",))
+        self._standing = Things(context, self._forms, ("still",))
+        self._movers = Things(context, self._forms, ("moving",))
+        self._still_for: tuple[float, ...] | None = None
+        self._shading: list[_Tile] = []
         self._around: list[_Tile] = []
         self._in_view: list[_Tile] = []
         self._anchor: Floats = np.zeros(2)
         self._fences = [self._fence(barrier) for barrier in barriers]
         self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
-        self._parts = [self._forms.id(("person", i), [Coat(p.mesh)]) for i, p in enumerate(people.PARTS)]
+        self._limbs = [
+            self._forms.id(("person", i), partial(_painted, part.mesh)) for i, part in enumerate(people.PARTS)
+        ]
 
-    def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None) -> None:
-        """Hold everything that a picture can show."""
+    def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None, body: bool) -> None:
+        """Hold everything that a picture can show. body: the robot itself is in the picture, not its shadow alone."""
         view, self._anchor = shot.view, anchor
         self._stream(view)
         time_s = Clock().time_s(street.tick)
@@ -78,21 +88,41 @@ class Scene:
             self._people(view.rows(street.people.xy, PERSON_MARGIN_M), street.people, time_s),
             self._vehicles(view.rows(street.vehicles.xy, VEHICLE_MARGIN_M), street.vehicles),
         ]
-        if robot is not None:
-            placed.append(self._robot(robot))
-        self._seen.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
+        myself = self._robot(robot) if robot is not None else _NOTHING
+        _set(self._seen, [*placed, myself] if body else placed)
+        if self._shadows:
+            self._cast(middle_of(view.eye_m), street, time_s, myself)
+
+    def _cast(self, middle: Floats, street: Street, time_s: float, robot: Placed) -> None:
+        """What throws shadows in the square around its middle, seen or not."""
+        people, cars = (
+            np.flatnonzero(np.abs(xy - middle).max(axis=1, initial=0.0) < REACH_M)
+            for xy in (street.people.xy, street.vehicles.xy)
+        )
+        movers = [self._people(people, street.people, time_s), self._vehicles(cars, street.vehicles), robot]
+        _set(self._movers, movers)
+        still = (*middle.tolist(), *self._anchor.tolist())
+        if still != self._still_for:
+            keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
+            self._shading = [self._tiles[key] for key in keys]
+            rows = [self._shifted(tile, np.arange(len(tile.thing_xy))) for tile in self._shading]
+            _set(self._standing, [*rows, *self._fences_now()])
+            self._still_for = still
 
     def draw(self, stage: Stage) -> None:
         """Draw what was arranged: the small and near first, then the ground from near to far."""
-        self._seen.draw(stage)
-        for tile in self._in_view:
-            tile.buffers.draw(stage, self._anchor)
+        for things in (self._seen, self._standing, self._movers):
+            things.draw(stage)
+        if stage != "moving":
+            for tile in self._in_view if stage == "colour" else self._shading:
+                tile.buffers.draw(stage, self._anchor)
 
     def release(self) -> None:
         for tile in self._tiles.values():
             tile.buffers.release()
         self._tiles.clear()
-        self._seen.release()
+        for things in (self._seen, self._standing, self._movers):
+            things.release()
         self._forms.release()
 
     def _stream(self, view: View) -> None:
@@ -118,7 +148,7 @@ class Scene:
         xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
         rows = instances(xyz, [prop.heading_rad for prop, _ in furniture], paint, LABELS["prop"])
-        pole = self._forms.id("signal post", [Coat(props.post_mesh(), props.POLE)])
+        pole = self._forms.id(("signal", "post"), lambda: [Coat(props.post_mesh(), props.POLE)])
         headings = [post.heading_rad for post in posts]
         poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
         things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
@@ -127,10 +157,9 @@ class Scene:
         return _Tile(buffers, things, thing_xy, seen_m, posts, post_z)
 
     def _prop_form(self, kind: str, variant: int) -> int:
-        key = ("prop", kind, variant)
-        if key in self._forms:
-            return self._forms.id(key)
-        return self._forms.id(key, [Coat(part.mesh, part.colour) for part in parts_of(kind, variant)])
+        return self._forms.id(
+            ("prop", kind, variant), lambda: [Coat(part.mesh, part.colour) for part in parts_of(kind, variant)]
+        )
 
     def _things(self, view: View) -> list[Placed]:
         """What stands in the tiles around, as far as it is drawn."""
@@ -151,7 +180,7 @@ class Scene:
         z = float(self._ground.heights([[barrier.x_m, barrier.y_m]])[0])
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
-        form = self._forms.id(("barrier", size), [Coat(red, props.RED), Coat(white, props.WHITE)])
+        form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.RED), Coat(white, props.WHITE)])
         rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.RED, LABELS["barrier"])
         return np.array([form]), rows
 
@@ -165,12 +194,13 @@ class Scene:
 
     def _lamps(self, street: Street) -> Placed:
         """The lit lamp of every signal whose state is known."""
+        lit = {walk: self._forms.id(("signal", walk), partial(_lamp, walk)) for walk in props.LAMPS}
         forms, at, heading, paint = [], [], [], []
         for tile in self._around:
             for post, z in zip(tile.posts, tile.post_z.tolist(), strict=True):
                 if post.crossing in street.signals:
                     walk = street.signals[post.crossing].walk
-                    forms.append(self._forms.id(("lamp", walk), [Coat(props.lamp_mesh(walk), None, glows=True)]))
+                    forms.append(lit[walk])
                     at.append((post.x_m - self._anchor[0], post.y_m - self._anchor[1], z))
                     heading.append(post.heading_rad)
                     paint.append(props.LAMPS[walk])
@@ -194,30 +224,43 @@ class Scene:
         paint = np.array([[colours[part.coat] for part in people.PARTS] for colours in map(people.colours, who.ids)])
         heading = (who.heading[:, None] + about_z).ravel()
         placed = instances(at.reshape(-1, 3), heading, paint.reshape(-1, 3), LABELS["person"], about_y.ravel())
-        return np.tile(np.array(self._parts), len(who)), placed
+        return np.tile(np.array(self._limbs), len(who)), placed
 
     def _vehicles(self, rows: NDArray[np.intp], which: Vehicles) -> Placed:
         if len(rows) == 0:
             return _NOTHING
         forms = []
         for length, width in which.size[rows].round(1).tolist():
-            key = ("vehicle", length, width)
-            if key not in self._forms:
-                body, glass, tyres = vehicles.vehicle_meshes(length, width)
-                self._forms.id(key, [Coat(body), Coat(glass, vehicles.GLASS), Coat(tyres, vehicles.TYRE)])
-            forms.append(self._forms.id(key))
+            forms.append(self._forms.id(("vehicle", length, width), partial(_vehicle, length, width)))
         at = np.column_stack([which.xy[rows] - self._anchor, np.zeros(len(rows))])
         paint = np.array([vehicles.paint(which.ids[i]) for i in rows])
         return np.array(forms), instances(at, which.heading[rows], paint, LABELS["vehicle"])
 
     def _robot(self, robot: RobotState) -> Placed:
         """The robot with its base frame at its pose, leaning with the ground."""
-        form = self._forms.id(("robot", self._model.name), robot_parts(self._model.urdf))
+        form = self._forms.id(("robot", self._model.name), partial(robot_parts, self._model.urdf))
         _, roll, pitch = self._ground.lean(robot.pose, self._model)
         rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
         rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
         rows["turn"] = _quaternion(roll, pitch, robot.pose.heading_rad)
         return np.array([form]), rows
+
+
+def _painted(mesh: Mesh) -> list[Coat]:
+    return [Coat(mesh)]
+
+
+def _lamp(walk: bool) -> list[Coat]:
+    return [Coat(props.lamp_mesh(walk), None, glows=True)]
+
+
+def _vehicle(length_m: float, width_m: float) -> list[Coat]:
+    body, glass, tyres = vehicles.vehicle_meshes(length_m, width_m)
+    return [Coat(body), Coat(glass, vehicles.GLASS), Coat(tyres, vehicles.TYRE)]
+
+
+def _set(things: Things, placed: Sequence[Placed]) -> None:
+    things.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
 
 
 def _in_wedge(view: View, xy: Floats, margin_m: float) -> list[int]:

@@ -89,7 +89,7 @@ class Lighting:
     ground: tuple[float, float, float] = (0.26, 0.25, 0.23)
     fog: tuple[float, float, float] = (0.65, 0.72, 0.785)
     zenith: tuple[float, float, float] = (0.13, 0.31, 0.646)
-    shadows: float = 0.0
+    shadows: float = 1.0
     exposure: float = 1.0
     fog_from_m: float = 20.0
     fog_per_m: float = 1.0 / 110.0
@@ -129,8 +129,10 @@ layout(binding = 7) uniform sampler2DShadow moving_shadow;
 float sunlit(vec3 at, vec3 normal) {
 #ifdef SHADOWS
     vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
+    vec2 off = abs(in_map.xy - 0.5);
+    float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
     float lit = min(texture(still_shadow, in_map), texture(moving_shadow, in_map));
-    return 1.0 - sun.w * (1.0 - lit);
+    return 1.0 - sun.w * inside * (1.0 - lit);
 #else
     return 1.0;
 #endif

@@ -1,0 +1,44 @@
+"""The cameras by name: `gl` where OpenGL can be had, `bullet` anywhere; `auto` takes the first that works.
+
+OpenGL and PyBullet are imported when a camera of theirs is asked for.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+from cosim.ports import CameraSpec
+from physics.gl import context
+
+if TYPE_CHECKING:
+    from physics.camera import BulletCamera
+    from physics.gl.camera import GlCamera
+    from physics.world import BulletWorld
+
+CameraName = Literal["gl", "bullet"]
+CameraChoice = Literal["auto", "gl", "bullet"]
+
+
+def chosen(choice: CameraChoice) -> CameraName:
+    """The camera that a choice comes to here. Raises EngineError when it is `gl` and there is no OpenGL."""
+    if choice == "auto":
+        return "gl" if context.available() else "bullet"
+    if choice == "gl":
+        context.context()
+    return choice
+
+
+def renderer_of(name: CameraName) -> str:
+    """What draws the pictures, as records name it: pictures are the same bits on the same renderer only."""
+    return context.renderer() if name == "gl" else "bullet-tiny"
+
+
+def camera_of(name: CameraName, world: BulletWorld, spec: CameraSpec, depth: bool = False) -> GlCamera | BulletCamera:
+    """A camera in a world, to be used in a `with` block."""
+    if name == "gl":
+        from physics.gl.camera import GlCamera
+
+        return GlCamera(world, spec, depth)
+    from physics.camera import BulletCamera
+
+    return BulletCamera(world, spec, depth)

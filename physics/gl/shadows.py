@@ -1,0 +1,93 @@
+"""Shadow maps: the street as the sun sees it, once for what stands and once for what moves.
+
+Both maps share one box around a point of a coarse lattice near the eye, set to whole texels, so that shadows do not
+swim; what stands is drawn anew only when that point changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import moderngl
+import numpy as np
+
+from cosim.geometry import Floats
+from physics.gl.shading import MOVING_UNIT, STILL_UNIT, Lighting, Stage
+
+REACH_M: Final = 32.0
+"""Half the side of the square that has shadows."""
+STEP_M: Final = 8.0
+"""The lattice of the box's middles."""
+_DEEP_M: Final = 80.0
+_STILL_PX: Final = 1024
+_MOVING_PX: Final = 1024
+
+
+def middle_of(eye_m: Floats) -> Floats:
+    """(2,) world metres: the middle of the square with shadows around an eye."""
+    return np.asarray(np.round(eye_m[:2] / STEP_M) * STEP_M)
+
+
+def shadow_matrix(middle: Floats, anchor: Floats, to_sun: tuple[float, float, float]) -> Floats:
+    """(4, 4) from metres relative to the anchor to the clip space of the maps."""
+    sun = np.asarray(to_sun) / np.linalg.norm(to_sun)
+    across = np.cross((0.0, 0.0, 1.0), sun)
+    across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    rows = np.stack([across, np.cross(sun, across), -sun])
+    texel = 2.0 * REACH_M / _STILL_PX
+    centre = rows @ np.array([*middle, 0.0])
+    centre[:2] = np.round(centre[:2] / texel) * texel
+    shift = rows @ np.array([*anchor, 0.0]) - centre
+    scale = np.array([1.0 / REACH_M, 1.0 / REACH_M, 1.0 / _DEEP_M])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rows * scale[:, None], shift * scale
+    return matrix
+
+
+class ShadowMaps:
+    """Two depth pictures from the sun."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._still, self._moving = (self._texture(pixels) for pixels in (_STILL_PX, _MOVING_PX))
+        self._frames = {
+            "still": context.framebuffer(depth_attachment=self._still),
+            "moving": context.framebuffer(depth_attachment=self._moving),
+        }
+        self._drawn_for: tuple[float, ...] | None = None
+
+    def _texture(self, pixels: int) -> moderngl.Texture:
+        texture = self._context.depth_texture((pixels, pixels))
+        texture.compare_func = "<="
+        texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        texture.repeat_x = texture.repeat_y = False
+        return texture
+
+    def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Stage], None]) -> None:
+        """Bring the maps up to date; the scene block must hold `shadow_matrix` as its camera."""
+        self._context.enable_only(moderngl.DEPTH_TEST)
+        self._context.depth_func = "<"
+        self._context.polygon_offset = 1.5, 4.0
+        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun)
+        if key != self._drawn_for:
+            self._draw("still", draw)
+            self._drawn_for = key
+        self._draw("moving", draw)
+        self._context.polygon_offset = 0.0, 0.0
+
+    def _draw(self, stage: Stage, draw: Callable[[Stage], None]) -> None:
+        frame = self._frames[stage]
+        frame.use()
+        frame.clear(depth=1.0)
+        draw(stage)
+
+    def bind(self) -> None:
+        self._still.use(STILL_UNIT)
+        self._moving.use(MOVING_UNIT)
+
+    def release(self) -> None:
+        for frame in self._frames.values():
+            frame.release()
+        self._still.release()
+        self._moving.release()
