@@ -25,7 +25,7 @@ from rich.progress import (
 from rich.table import Column, Table
 
 from cosim.cli_city import city_app
-from cosim.cli_eyes import film, look
+from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
 from cosim.cli_map import map_app
 from cosim.errors import CosimError, UsageError
 
@@ -80,11 +80,14 @@ def run(
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
+    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Run a suite with a policy and print its table."""
     from cosim.policies.load import load_policy
+    from cosim.record import NO_RENDERER
     from cosim.runfolder import RunFolder, RunSpec
     from cosim.versions import versions
+    from physics.cameras import renderer_of
     from scenarios.catalog import chosen
     from scenarios.catalog import suite as shipped
     from scenarios.pool import run_all
@@ -99,6 +102,7 @@ def run(
         whole = shipped(suite)
     picked = chosen(whole, scenario or (), episodes)
     manifest = load_policy(policy).manifest
+    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     spec = RunSpec(
         suite=whole.name,
         suite_version=whole.version,
@@ -108,6 +112,7 @@ def run(
         policy_version=manifest.version,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
+        renderer=renderer_of(drawn_by) if manifest.camera is not None else NO_RENDERER,
     )
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
@@ -123,7 +128,10 @@ def run(
         signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with board.bars:
-                run_all(held, todo, policy, manifest, jobs=jobs, tell=board.tell, frames_every_s=frames)
+                tell = board.tell
+                run_all(
+                    held, todo, policy, manifest, jobs=jobs, tell=tell, frames_every_s=frames, camera=drawn_by
+                )  # fmt: skip
         except KeyboardInterrupt:
             finished = len(held.finished())
             again = " ".join(a for a in sys.argv[1:] if a != "--resume")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 from rich.console import Console
@@ -14,6 +14,19 @@ from cosim.errors import UsageError, unknown
 
 out = Console()
 err = Console(stderr=True)
+
+Choice = Literal["auto", "gl", "bullet"]
+CAMERA_HELP = "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), or auto: gl where it works."
+
+
+def camera_here(choice: Choice) -> Literal["gl", "bullet"]:
+    """The camera that a choice comes to on this machine; says so where auto is not gl. Raises EngineError."""
+    from physics.cameras import chosen
+
+    name = chosen(choice)
+    if choice == "auto" and name == "bullet":
+        err.print("No OpenGL here: the bullet camera draws the pictures (`cosim doctor` says why).")
+    return name
 
 
 def look(
@@ -26,6 +39,7 @@ def look(
     ] = "long-horizon",
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
     output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
+    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
     from scenarios.catalog import chosen
@@ -38,7 +52,7 @@ def look(
     pixels = size_of(size)
     (one,) = chosen(shipped(suite), [scenario])
     with err.status(f"driving to {at:g} s ..." if at else "setting up ..."):
-        image, time_s = look(one, policy, at, picked, pixels)
+        image, time_s = look(one, policy, at, picked, pixels, camera_here(camera))
     save(image, output)
     out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
 
@@ -53,6 +67,7 @@ def film(
     end: Annotated[float | None, typer.Option("--to", help="Last second; by default the end.")] = None,
     size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
+    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Film an episode of a run: from behind the robot, with its own view, the map, events and failures."""
     from cosim.runfolder import read_records
@@ -70,7 +85,7 @@ def film(
             folder,
             episode,
             output,
-            Cut(start, math.inf if end is None else end, size_of(size), speed),
+            Cut(start, math.inf if end is None else end, size_of(size), speed, camera_here(camera)),
             lambda done, of: bars.update(task, completed=done, total=of),
         )
     out.print(f"Film: {output}", soft_wrap=True, highlight=False)

@@ -26,6 +26,8 @@ from cosim.step import Step
 from cosim.versions import versions
 
 SCHEMA = 1
+NO_RENDERER = "none"
+"""The renderer of an episode whose policy has no camera."""
 
 Status = Literal["done", "crashed"]
 
@@ -144,7 +146,7 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str) -> Record:
         policy=manifest.name,
         policy_version=manifest.version,
         goal_protocol="route" if manifest.privileged else "none",
-        renderer="none",
+        renderer=NO_RENDERER,
         versions=versions(),
         status="crashed",
     )

@@ -1,6 +1,6 @@
 """A run folder: what was asked for, and what came out, episode by episode; survives a kill at any moment.
 
-run.json                         what is run: suite, policy, scenarios, versions
+run.json                         what is run: suite, policy, scenarios, versions, renderer
 scenarios.json                   the resolved specs
 episodes/<scenario>/record.json  and trajectory.npz, written by the worker, whole or not at all
 results.sqlite                   one row per finished episode, in the order in which they ended
@@ -34,7 +34,7 @@ UNFINISHED = {"episodes", "logs", "scenarios.json", "run.json.part"}
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Two runs with the same RunSpec have the same results."""
+    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures."""
 
     suite: str
     suite_version: str
@@ -44,6 +44,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_version: str
     scenarios: tuple[str, ...]
     versions: dict[str, str]
+    renderer: str = "unknown"
     schema: int = 1
 
 
@@ -79,7 +80,7 @@ class RunFolder:
     def resume(cls, path: Path, spec: RunSpec) -> RunFolder:
         """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run."""
         found = read_spec(path)
-        for field in ("suite", "suite_hash", "policy", "policy_version", "scenarios", "versions"):
+        for field in ("suite", "suite_hash", "policy", "policy_version", "scenarios", "versions", "renderer"):
             mine, theirs = getattr(spec, field), getattr(found, field)
             if mine != theirs:
                 raise RunError(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal
 
 from cosim.ports import CameraSpec
+from cosim.scenario import Light
 from physics.gl import context
 
 if TYPE_CHECKING:
@@ -33,12 +34,14 @@ def renderer_of(name: CameraName) -> str:
     return context.renderer() if name == "gl" else "bullet-tiny"
 
 
-def camera_of(name: CameraName, world: BulletWorld, spec: CameraSpec, depth: bool = False) -> GlCamera | BulletCamera:
-    """A camera in a world, to be used in a `with` block."""
+def camera_of(
+    name: CameraName, world: BulletWorld, spec: CameraSpec, *, light: Light | None = None, depth: bool = False
+) -> GlCamera | BulletCamera:
+    """A camera in a world, to be used in a `with` block. light: for the gl camera; the other's light is always day."""
     if name == "gl":
         from physics.gl.camera import GlCamera
 
-        return GlCamera(world, spec, depth)
+        return GlCamera(world, spec, depth, light or Light())
     from physics.camera import BulletCamera
 
     return BulletCamera(world, spec, depth)

@@ -19,9 +19,10 @@ from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.loop import Parts
 from cosim.ports import CameraSpec, Director, Eyes, Policy
+from cosim.record import NO_RENDERER
 from cosim.scenario import City, Place, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
-from physics.camera import BulletCamera
+from physics.cameras import CameraChoice, camera_of, chosen, renderer_of
 from physics.furniture import Prop, footprints
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
@@ -37,7 +38,8 @@ CORRIDOR_M = 40.0
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """A scenario ready to run. area: where the robot may be, for the referee. eyes: makes further cameras."""
+    """A scenario ready to run. area: where the robot may be, for the referee. renderer: what draws for the policy.
+    eyes: makes further cameras."""
 
     parts: Parts
     area: WalkableArea
@@ -47,8 +49,8 @@ class Stage:
 
 
 @contextmanager
-def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
-    """Start every engine of a scenario; all are closed at the end, whatever happened."""
+def staged(scenario: Scenario, policy: Policy, choice: CameraChoice = "auto") -> Iterator[Stage]:
+    """Start every engine of a scenario; all are closed at the end, whatever happened. choice: what draws pictures."""
     manifest = policy.manifest
     clock = Clock.for_rate(manifest.rate_hz)
     net_path, street_map = place(scenario.place)
@@ -64,17 +66,20 @@ def staged(scenario: Scenario, policy: Policy) -> Iterator[Stage]:
             net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2], world.footprint_m
         )
         stack.enter_context(crowd)
-        camera = None
+
+        def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
+            return camera_of(chosen(choice), world, spec, light=scenario.light)
+
+        camera, renderer = None, NO_RENDERER
         if manifest.camera is not None:
-            camera = stack.enter_context(BulletCamera(world, manifest.camera))
+            camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(chosen(choice))
         director = stack.enter_context(directed(scenario.id))
         half_width_m = world.footprint_m[1] / 2
         footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
         free = shapely.buffer(footing, -half_width_m)
         shapely.prepare(free)
         parts = Parts(world, crowd, director, policy, camera, Limits(), free)
-        renderer = "bullet-tiny" if camera else "none"
-        yield Stage(parts, WalkableArea(walkable), clock, renderer, lambda spec: BulletCamera(world, spec))
+        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes)
 
 
 def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:

@@ -11,12 +11,13 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
-from cosim.errors import CosimError
+from cosim.errors import CosimError, EngineError
 from cosim.events import EventQuery
 from cosim.policies.baselines import Straight
 from cosim.scenario import City, CrowdSpec, Scenario
 from cosim.versions import versions
 from cosim.walks import WalkGraph
+from physics.cameras import chosen, renderer_of
 from scenarios.assemble import directed, place, staged
 from scenarios.long_horizon import build
 from sumo_nets.store import cache_folder
@@ -60,6 +61,14 @@ def bridge() -> str:
     return "a director answered over a Zenoh session"
 
 
+def cameras() -> str:
+    """Which camera `--camera auto` takes, and why."""
+    try:
+        return f"gl works and is taken ({renderer_of(chosen('gl'))}); so does bullet"
+    except EngineError as error:
+        return f"bullet works and is taken; gl does not: {error}"
+
+
 def frame() -> str:
     """One frame and one step of a small city, with crowd and physics."""
     scenario = small_scenario()
@@ -71,7 +80,8 @@ def frame() -> str:
         if len(np.unique(picture.rgb.reshape(-1, 3), axis=0)) < 5:
             raise CosimError("the camera's picture is blank")
         height, width, _ = picture.rgb.shape
-        return f"SUMO walks {len(parts.crowd.street.people)} people, PyBullet draws {width}x{height}"
+        people = len(parts.crowd.street.people)
+        return f"SUMO walks {people} people, PyBullet holds the robot, {stage.renderer} draws {width}x{height}"
 
 
 def small_scenario() -> Scenario:
@@ -82,5 +92,8 @@ def small_scenario() -> Scenario:
 
 
 CHECKS: Mapping[str, Callable[[], str]] = MappingProxyType(
-    {"packages": packages, "names": names, "cache": cache, "city": city, "bridge": bridge, "frame": frame}
-)
+    {
+        "packages": packages, "names": names, "cache": cache, "city": city, "bridge": bridge, "cameras": cameras,
+        "frame": frame,
+    }
+)  # fmt: skip

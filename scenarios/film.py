@@ -28,6 +28,7 @@ from cosim.report.video import Video
 from cosim.scenario import Scenario, read_suite
 from cosim.state import RobotState, Street
 from cosim.step import Step
+from physics.cameras import CameraChoice
 from scenarios.assemble import place, staged
 from scenarios.look import behind
 from scenarios.run import drive
@@ -39,12 +40,14 @@ ROBOT_EYE: Final = CameraSpec(384, 288, 75.0)
 
 
 class Cut(NamedTuple):
-    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times real time."""
+    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times real time;
+    camera: what draws it."""
 
     from_s: float = 0.0
     to_s: float = math.inf
     size: tuple[int, int] = (1280, 720)
     speed: int = 1
+    camera: CameraChoice = "auto"
 
 
 Tell = Callable[[int, int], None]
@@ -67,7 +70,7 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
     driver = Replay(log.command)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        stage = stack.enter_context(staged(scenario, driver))
+        stage = stack.enter_context(staged(scenario, driver, cut.camera))
         camera = stack.enter_context(stage.eyes(ROBOT_EYE))
         reel = _Reel(scenario, record, Minimap(street_map, scenario), camera, video, cut, last, tell)
         again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)

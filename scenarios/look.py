@@ -17,6 +17,7 @@ from cosim.report.above import Image
 from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.step import Step
+from physics.cameras import CameraChoice
 from scenarios.assemble import staged
 from scenarios.run import drive
 
@@ -36,7 +37,9 @@ class _Reached(Exception):
         self.robot, self.street = robot, street
 
 
-def look(scenario: Scenario, policy: str, at_s: float, view: View, size: tuple[int, int]) -> tuple[Image, float]:
+def look(
+    scenario: Scenario, policy: str, at_s: float, view: View, size: tuple[int, int], camera_name: CameraChoice = "auto"
+) -> tuple[Image, float]:
     """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if that comes first.
 
     policy: who drives until then. size: width, height.
@@ -44,7 +47,7 @@ def look(scenario: Scenario, policy: str, at_s: float, view: View, size: tuple[i
     driver = load_policy(policy)
     last = Clock().ticks(at_s)
     spec = CameraSpec(*size) if driver.manifest.camera is None else CameraSpec(*size, driver.manifest.camera.fov_deg)
-    with staged(scenario, driver) as stage, stage.eyes(spec) as camera:
+    with staged(scenario, driver, camera_name) as stage, stage.eyes(spec) as camera:
         seen: list[Step] = []
 
         def watch(step: Step, _: Verdict) -> None:

@@ -10,12 +10,16 @@ from cosim.scenario import Scenario
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames."""
+    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames.
+
+    camera: what draws the pictures, the same for a whole run.
+    """
 
     scenario: Scenario
     suite_hash: str
     folder: str
     frames_every_s: float = 0.0
+    camera: Literal["gl", "bullet"] = "bullet"
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):

@@ -24,6 +24,7 @@ from cosim.ports import Manifest
 from cosim.record import begun
 from cosim.runfolder import RunFolder
 from cosim.scenario import Scenario
+from physics.cameras import CameraName
 from scenarios import worker
 from scenarios.messages import Done, Job, Message, Unsaved, decode_message, encode
 
@@ -56,9 +57,10 @@ def run_all(
     jobs: int,
     tell: Tell,
     frames_every_s: float = 0.0,
+    camera: CameraName = "bullet",
 ) -> None:
     """Run scenarios, `jobs` at a time, adding each record to the folder as it ends."""
-    pool = _Pool(folder, policy, manifest, tell, frames_every_s)
+    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera)
     waiting = deque(scenarios)
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
@@ -78,9 +80,17 @@ def run_all(
 class _Pool:
     """The workers of one run."""
 
-    def __init__(self, folder: RunFolder, policy: str, manifest: Manifest, tell: Tell, frames_every_s: float) -> None:
+    def __init__(
+        self,
+        folder: RunFolder,
+        policy: str,
+        manifest: Manifest,
+        tell: Tell,
+        frames_every_s: float,
+        camera: CameraName,
+    ) -> None:
         self._folder, self._policy, self._manifest = folder, policy, manifest
-        self._tell, self._frames_every_s = tell, frames_every_s
+        self._tell, self._frames_every_s, self._camera = tell, frames_every_s, camera
         self._workers: list[_Worker] = []
         self._started = 0
 
@@ -95,7 +105,8 @@ class _Pool:
         target = str(self._folder.episode_folder(scenario.id))
         (Path(target) / "record.json").unlink(missing_ok=True)
         try:
-            idle.pipe.send_bytes(encode(Job(scenario, self._folder.spec.suite_hash, target, self._frames_every_s)))
+            suite_hash = self._folder.spec.suite_hash
+            idle.pipe.send_bytes(encode(Job(scenario, suite_hash, target, self._frames_every_s, self._camera)))
         except BrokenPipeError:
             idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out
 

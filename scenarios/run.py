@@ -19,6 +19,7 @@ from cosim.record import Log, Record, Recorder, TriggeredEvent, begun
 from cosim.referee import Failure, Referee, Verdict
 from cosim.scenario import Scenario
 from cosim.step import Step
+from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
 
 PASSED_M = 5.0
@@ -36,12 +37,19 @@ class Outcome:
     traceback: str = ""
 
 
-def episode(scenario: Scenario, policy: Policy, *, suite_hash: str = "", watch: Watch | None = None) -> Outcome:
+def episode(
+    scenario: Scenario,
+    policy: Policy,
+    *,
+    suite_hash: str = "",
+    camera: CameraChoice = "auto",
+    watch: Watch | None = None,
+) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`."""
     began = time.perf_counter()
     record = begun(scenario, policy.manifest, suite_hash)
     try:
-        with staged(scenario, policy) as stage:
+        with staged(scenario, policy, camera) as stage:
             record = replaced(record, renderer=stage.renderer)
             first_tick_s = time.perf_counter() - began
             record, log = drive(record, scenario, stage, watch)

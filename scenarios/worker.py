@@ -47,7 +47,8 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
             job = decode_job(pipe.recv_bytes())
         except EOFError:
             return
-        outcome = episode(job.scenario, driver, suite_hash=job.suite_hash, watch=watcher(job, pipe))
+        watch = watcher(job, pipe)
+        outcome = episode(job.scenario, driver, suite_hash=job.suite_hash, camera=job.camera, watch=watch)
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
             driver = load_policy(policy)

@@ -131,7 +131,7 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, whole_run: Pat
     table = rows(whole_run)
     assert list(table.index) == ["t-0", "t-1", "t-2"]
     assert set(table["status"]) == {"done"}
-    assert set(table["renderer"]) == {"bullet-tiny"}
+    assert set(table["renderer"]) == {json.loads((whole_run / "run.json").read_text())["renderer"]}
     for name in table.index:
         assert (whole_run / "episodes" / name / "trajectory.npz").exists()
     shown = cosim("show", "whole", cwd=desk)

@@ -15,16 +15,19 @@ from numpy.typing import ArrayLike
 
 from cosim.errors import EngineError
 from cosim.ports import CameraSpec
+from cosim.scenario import Light
 from cosim.state import Frame, RobotState, Street
 from physics.gl.backdrop import Backdrop
 from physics.gl.context import context
+from physics.gl.lighting import lighting_of
 from physics.gl.scene import Scene
-from physics.gl.shading import DAY, Lighting, SceneBlock, anchor_of, camera_matrix
+from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.gl.shadows import ShadowMaps, middle_of, shadow_matrix
 from physics.gl.targets import Target
 from physics.view import Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
 
+NOON: Final = Light()
 _TARGETS_MAX: Final = 4
 _TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
 """From clip space to the space of a texture."""
@@ -33,10 +36,10 @@ _TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0,
 class GlCamera:
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
-    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Lighting = DAY) -> None:
+    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
         self.spec = spec
-        self._world, self._depth, self._light = world, depth, light
+        self._world, self._depth, self._light = world, depth, lighting_of(light)
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
 

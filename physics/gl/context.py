@@ -44,7 +44,9 @@ def available() -> bool:
     return True
 
 
+@lru_cache(maxsize=1)
 def renderer() -> str:
     """The renderer as it is named in records: pictures are the same bits on the same renderer only."""
-    info = context().info
+    with context() as gl:
+        info = gl.info
     return f"gl: {info['GL_RENDERER']}, {info['GL_VERSION']}"

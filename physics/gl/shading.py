@@ -10,8 +10,8 @@ fragment shader   calls `show(albedo, normal, at, label)` once, or `glow(colour,
                   cosim.state.LABELS. In the shadow pass it is not run: leave the depth alone and do not discard.
 
 Positions are relative to the anchor, a point of the ground near the eye on a lattice of ANCHOR_M, so that float32 holds
-them to a hundredth of a millimetre anywhere in a city. `Lighting.anchor` is it, in world metres: subtract it in
-float64 before an upload.
+them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres: subtract
+it in float64 before an upload.
 
 The uniform block `Scene` (binding SCENE_BINDING, written once per pass by `SceneBlock`):
 
@@ -43,13 +43,13 @@ of a kind returns at once. Back faces are culled in the picture; front faces are
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, Protocol
 
 import moderngl
 import numpy as np
 
 from cosim.geometry import Floats
+from physics.gl.lighting import Lighting
 from physics.view import FAR_M, NEAR_M, Shot
 
 Stage = Literal["colour", "still", "moving"]
@@ -75,28 +75,6 @@ class Programs(NamedTuple):
     def of(self, stage: Stage) -> moderngl.Program:
         return self.colour if stage == "colour" else self.shadow
 
-
-@dataclass(frozen=True, slots=True)
-class Lighting:
-    """The light of a picture, linear rgb. to_sun: (3,) unit vector; shadows: how dark, 0 (off) to 1.
-
-    fog_from_m, fog_per_m, fog_most: share of the fog's colour at a distance.
-    """
-
-    to_sun: tuple[float, float, float] = (0.36, -0.52, 0.775)
-    sun: tuple[float, float, float] = (0.62, 0.59, 0.54)
-    sky: tuple[float, float, float] = (0.46, 0.50, 0.56)
-    ground: tuple[float, float, float] = (0.26, 0.25, 0.23)
-    fog: tuple[float, float, float] = (0.65, 0.72, 0.785)
-    zenith: tuple[float, float, float] = (0.13, 0.31, 0.646)
-    shadows: float = 1.0
-    exposure: float = 1.0
-    fog_from_m: float = 20.0
-    fog_per_m: float = 1.0 / 110.0
-    fog_most: float = 0.85
-
-
-DAY: Final = Lighting()
 
 _BLOCK = """#version 430
 layout(std140, binding = 0) uniform Scene {

@@ -13,7 +13,8 @@ import moderngl
 import numpy as np
 
 from cosim.geometry import Floats
-from physics.gl.shading import MOVING_UNIT, STILL_UNIT, Lighting, Stage
+from physics.gl.lighting import Lighting
+from physics.gl.shading import MOVING_UNIT, STILL_UNIT, Stage
 
 REACH_M: Final = 32.0
 """Half the side of the square that has shadows."""
