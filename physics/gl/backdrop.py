@@ -7,7 +7,9 @@ from typing import Final
 import moderngl
 
 from cosim.state import LABELS
-from physics.gl.shading import programs, put
+from physics.gl.lighting import sky_texture
+from physics.gl.shading import SKY_UNIT, programs
+from physics.sky import Sky
 
 _VERTEX: Final = """
 out vec2 spot;
@@ -18,13 +20,13 @@ void main() {
 """
 
 _FRAGMENT: Final = f"""
+layout(binding = {SKY_UNIT}) uniform sampler2D sky;
 in vec2 spot;
-uniform vec3 zenith;
 void main() {{
     vec3 ray = normalize(ahead.xyz + spot.x * right.w * right.xyz - spot.y * up.w * up.xyz);
-    float rise = clamp(asin(ray.z) / 0.7, 0.0, 1.0);
-    pixel = vec4(sqrt(min(mix(fog.rgb, zenith, rise) * eye.w, 1.0)),
-                 (ray.z < 0.0 ? {LABELS["ground"]}.0 : {LABELS["sky"]}.0) / 255.0);
+    vec2 where = vec2(0.5 - atan(ray.y, ray.x) * 0.15915494, 0.5 - asin(ray.z) * 0.31830989);
+    float label = ray.z < 0.0 ? {LABELS["ground"]}.0 : {LABELS["sky"]}.0;
+    pixel = vec4(on_screen(texture(sky, where).rgb), label / 255.0);
 }}
 """
 
@@ -32,13 +34,14 @@ void main() {{
 class Backdrop:
     """One triangle over the whole picture, at the far end of the depth; draw it last."""
 
-    def __init__(self, context: moderngl.Context) -> None:
-        self._program = programs(context, _VERTEX, _FRAGMENT, shadows=False).colour
-        self._array = context.vertex_array(self._program, [])
+    def __init__(self, context: moderngl.Context, sky: Sky) -> None:
+        self._array = context.vertex_array(programs(context, _VERTEX, _FRAGMENT, shadows=False).colour, [])
+        self._sky = sky_texture(context, sky.radiance)
 
-    def draw(self, zenith: tuple[float, float, float]) -> None:
-        put(self._program, "zenith", zenith)
+    def draw(self) -> None:
+        self._sky.use(SKY_UNIT)
         self._array.render(moderngl.TRIANGLES, vertices=3)
 
     def release(self) -> None:
         self._array.release()
+        self._sky.release()

@@ -24,6 +24,7 @@ from physics.gl.scene import Scene
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.gl.shadows import ShadowMaps, middle_of, shadow_matrix
 from physics.gl.targets import Target
+from physics.sky import sky_of
 from physics.view import Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
 
@@ -39,18 +40,19 @@ class GlCamera:
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
         self.spec = spec
-        self._world, self._depth, self._light = world, depth, lighting_of(light)
+        self._world, self._depth, self._sky = world, depth, sky_of(light, world.ground.seed)
+        self._light = lighting_of(self._sky)
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
 
     def __enter__(self) -> Self:
         if self._context is None:
-            world, shadows = self._world, self._light.shadows > 0.0
+            world, shadows = self._world, self._light.shadows
             with context() as gl:
                 self._scene = Scene(gl, world.ground, world.barriers, world.model, shadows)
                 self._shadows = ShadowMaps(gl) if shadows else None
                 self._block = SceneBlock(gl)
-                self._backdrop = Backdrop(gl)
+                self._backdrop = Backdrop(gl, self._sky)
             self._context = gl
         return self
 
@@ -111,7 +113,7 @@ class GlCamera:
             target.frame.clear(depth=1.0)
             self._scene.draw("colour")
             gl.depth_func = "<="
-            self._backdrop.draw(self._light.zenith)
+            self._backdrop.draw()
             rgb, labels = target.read()
             return Frame(rgb, labels, target.read_depth() if self._depth else None)
 

@@ -1,36 +1,67 @@
-"""The light of a picture, made from a scenario's light."""
+"""The light of a picture as shaders take it, made from a sky."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import Final
 
-from cosim.scenario import Light
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.geometry import Floats
+from physics.sky import Sky
+
+HAZE_FROM_M: Final = 20.0
+HAZE_PER_M: Final = 1.0 / 110.0
+HAZE_MOST: Final = 0.85
+"""Beside the fog of a scenario distant things fade a little in any weather, so that the end of the drawn world is no
+edge; the bullet camera does the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """The light of a picture, linear rgb. to_sun: (3,) unit vector; shadows: how dark, 0 (off) to 1.
+    """Linear radiances, as in physics.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that looks
+    there; lamps: 0 by day to 1 at night; shadows: whether there are any."""
 
-    fog_from_m, fog_per_m, fog_most: share of the fog's colour at a distance.
-    """
+    to_sun: Floats
+    sun: Floats
+    up: Floats
+    side: Floats
+    down: Floats
+    fog: Floats
+    fog_per_m: float
+    exposure: float
+    lamps: float
+    shadows: bool
 
-    to_sun: tuple[float, float, float] = (0.36, -0.52, 0.775)
-    sun: tuple[float, float, float] = (0.62, 0.59, 0.54)
-    sky: tuple[float, float, float] = (0.46, 0.50, 0.56)
-    ground: tuple[float, float, float] = (0.26, 0.25, 0.23)
-    fog: tuple[float, float, float] = (0.65, 0.72, 0.785)
-    zenith: tuple[float, float, float] = (0.13, 0.31, 0.646)
-    shadows: float = 1.0
-    exposure: float = 1.0
-    fog_from_m: float = 20.0
-    fog_per_m: float = 1.0 / 110.0
-    fog_most: float = 0.85
+    def rows(self) -> list[tuple[float, ...]]:
+        """What the uniform block `Scene` holds of it, vec4 after vec4."""
+        return [
+            (*self.to_sun, float(self.shadows)),
+            (*self.sun, self.exposure),
+            (*self.side, self.lamps),
+            (*(0.5 * (self.up - self.down)), 0.0),
+            (*(0.5 * (self.up + self.down) - self.side), 0.0),
+            (*self.fog, self.fog_per_m),
+            (HAZE_FROM_M, HAZE_PER_M, HAZE_MOST, 0.0),
+        ]
 
 
-def lighting_of(light: Light) -> Lighting:
-    """What a scenario's light is in a picture."""
-    shadows = float(light.shadows) * (1.0 - light.cloud_cover)
-    day = Lighting(shadows=shadows, exposure=2.0**light.exposure_ev)
-    if light.fog_m is None:
-        return day
-    return replace(day, fog_from_m=0.0, fog_per_m=0.95 / light.fog_m, fog_most=1.0)
+def lighting_of(sky: Sky) -> Lighting:
+    """What a sky is to the shaders."""
+    up, side, down = sky.ambient
+    return Lighting(
+        sky.sun, sky.sun_colour, up, side, down, sky.fog_colour, sky.fog_per_m, sky.exposure, sky.lamps, sky.shadows
+    )
+
+
+def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> moderngl.Texture:
+    """An equirectangular picture (H, W, 3) as a texture."""
+    rows, columns, _ = radiance.shape
+    texture = context.texture(
+        (columns, rows), 3, np.minimum(radiance, 6.0e4).astype(np.float16).tobytes(), dtype="f2", alignment=2
+    )
+    texture.filter = moderngl.LINEAR, moderngl.LINEAR
+    texture.repeat_x, texture.repeat_y = True, False
+    return texture

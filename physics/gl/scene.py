@@ -23,7 +23,9 @@ from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
 from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
 from physics.gl.shadows import REACH_M, STEP_M, middle_of
-from physics.gl.tiles import TileBuffers, tile_programs
+from physics.gl.surfaces import surfaces
+from physics.gl.tiles import TileBuffers, TileShaders
+from physics.gl.walls import WallBuffers, WallShaders
 from physics.ground import Ground
 from physics.mesh import Mesh
 from physics.robots import RobotModel
@@ -44,11 +46,16 @@ class _Tile:
     Their rows are relative to the tile's middle."""
 
     buffers: TileBuffers
+    walls: WallBuffers
     things: Placed
     thing_xy: Floats
     seen_m: Floats
     posts: list[props.SignalPost]
     post_z: Floats
+
+    def release(self) -> None:
+        self.buffers.release()
+        self.walls.release()
 
 
 class Scene:
@@ -60,7 +67,9 @@ class Scene:
         self._context, self._ground, self._model = context, ground, model
         self._tiles: dict[Key, _Tile] = {}
         self._shadows = shadows
-        self._shaders = tile_programs(context, shadows)
+        self._surfaces = surfaces(context)
+        self._shaders = TileShaders(context, self._surfaces, shadows)
+        self._wall_shaders = WallShaders(context, self._surfaces, shadows)
         self._forms = Forms(context, shadows)
         self._seen = Things(context, self._forms, ("colour",))
         self._standing = Things(context, self._forms, ("still",))
@@ -113,13 +122,16 @@ class Scene:
         """Draw what was arranged: the small and near first, then the ground from near to far."""
         for things in (self._seen, self._standing, self._movers):
             things.draw(stage)
+        if stage == "colour":
+            self._surfaces.bind()
         if stage != "moving":
             for tile in self._in_view if stage == "colour" else self._shading:
+                tile.walls.draw(stage, self._anchor)
                 tile.buffers.draw(stage, self._anchor)
 
     def release(self) -> None:
         for tile in self._tiles.values():
-            tile.buffers.release()
+            tile.release()
         self._tiles.clear()
         for things in (self._seen, self._standing, self._movers):
             things.release()
@@ -128,7 +140,7 @@ class Scene:
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
         for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
-            self._tiles.pop(key).buffers.release()
+            self._tiles.pop(key).release()
         keys = sorted(keys_within(x, y, VISIBLE_M), key=lambda key: (distance_to(key, x, y), key))
         for key in keys:
             if key not in self._tiles:
@@ -138,8 +150,9 @@ class Scene:
         self._in_view = [self._around[i] for i in _in_wedge(view, middles, _TILE_REACH_M)]
 
     def _built(self, key: Key) -> _Tile:
-        buffers = TileBuffers(self._context, self._shaders, self._ground, key)
+        buffers = TileBuffers(self._context, self._shaders, self._ground.tile(key), self._ground.seed)
         middle = buffers.middle
+        walls = WallBuffers(self._context, self._wall_shaders, self._ground.buildings(key), middle)
         posts = props.posts_in(self._ground.street_map, key)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._ground.heights(post_xy)
@@ -154,7 +167,7 @@ class Scene:
         things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
         seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
-        return _Tile(buffers, things, thing_xy, seen_m, posts, post_z)
+        return _Tile(buffers, walls, things, thing_xy, seen_m, posts, post_z)
 
     def _prop_form(self, kind: str, variant: int) -> int:
         return self._forms.id(

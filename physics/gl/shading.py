@@ -5,9 +5,10 @@ A drawable's program is written once and works in every pass. `programs` puts th
 vertex shader     reads its own attributes and ends with `gl_Position = project(at);`, where `at` is a position in
                   metres relative to the anchor of the picture (below). Normals are in world axes.
 fragment shader   calls `show(albedo, normal, at, label)` once, or `glow(colour, label)` for what shines by itself.
-                  albedo, colour: vec3 as one would write it for a screen, 0 to 1 (gamma 2: linear light is its
-                  square); normal: vec3, unit length or nearly; at: as in the vertex shader; label: float, an id of
-                  cosim.state.LABELS. In the shadow pass it is not run: leave the depth alone and do not discard.
+                  albedo, colour: vec3 sRGB, 0 to 1; normal: vec3, unit length or nearly; at: as in the vertex
+                  shader; label: float, an id of cosim.state.LABELS. `show_linear` takes a linear albedo (sRGB
+                  textures are decoded when they are read) and a radiance of the surface's own.
+                  In the shadow pass it is not run: leave the depth alone and do not discard.
 
 Positions are relative to the anchor, a point of the ground near the eye on a lattice of ANCHOR_M, so that float32 holds
 them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres: subtract
@@ -17,18 +18,19 @@ The uniform block `Scene` (binding SCENE_BINDING, written once per pass by `Scen
 
     mat4 clip_from_at      the camera's, or the sun's in the shadow pass; `project` is all that needs it
     mat4 shadow_from_at    to the shadow map's texture space
-    vec4 eye               xyz from the anchor; w exposure
-    vec4 sun               xyz towards the sun; w how dark its shadows are, 0 (off) to 1
-    vec4 sun_light         rgb linear
-    vec4 sky_light         rgb linear, ambient from above
-    vec4 ground_light      rgb linear, ambient from below
-    vec4 fog               rgb linear; w largest share
-    vec4 fog_range         x where it begins in metres; y share per metre
+    vec4 eye               xyz from the anchor
+    vec4 sun               xyz towards the sun; w 1 where it throws shadows
+    vec4 sun_light         rgb linear; w exposure
+    vec4 side_light        rgb linear, ambient of an upright surface; w lamps: 0 by day to 1 at night
+    vec4 tilt_light        rgb linear, what is added times the z of the normal
+    vec4 flat_light        rgb linear, what is added times the size of the z of the normal
+    vec4 fog               rgb linear; w extinction per metre
+    vec4 haze              where it begins in metres, share per metre, largest share
     vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
     vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half its width and height
 
-Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks and drives); free
-for drawables are units 0 to 5.
+Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks and drives), SKY_UNIT
+holds the sky, SURFACES_UNIT and FACADES_UNIT the textures of ground and walls; free for drawables are units 0 to 2.
 
 A drawable takes part in a pass by
 
@@ -55,6 +57,9 @@ from physics.view import FAR_M, NEAR_M, Shot
 Stage = Literal["colour", "still", "moving"]
 
 SCENE_BINDING: Final = 0
+SURFACES_UNIT: Final = 3
+FACADES_UNIT: Final = 4
+SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
 ANCHOR_M: Final = 64.0
@@ -83,10 +88,11 @@ layout(std140, binding = 0) uniform Scene {
     vec4 eye;
     vec4 sun;
     vec4 sun_light;
-    vec4 sky_light;
-    vec4 ground_light;
+    vec4 side_light;
+    vec4 tilt_light;
+    vec4 flat_light;
     vec4 fog;
-    vec4 fog_range;
+    vec4 haze;
     vec4 anchor;
     vec4 right;
     vec4 up;
@@ -98,6 +104,11 @@ _VERTEX = """
 vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
 vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
 """
+
+_DECODED = """
+vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.012522878); }
+"""
+"""sRGB to linear: a cubic that is right to about a level."""
 
 _FRAGMENT = """
 out vec4 pixel;
@@ -116,22 +127,32 @@ float sunlit(vec3 at, vec3 normal) {
 #endif
 }
 
-vec3 on_screen(vec3 light, float share_of_fog) {
-    vec3 seen = mix(light, fog.rgb, share_of_fog) * eye.w;
-    return sqrt(min(seen, 1.0));
+vec3 on_screen(vec3 light) {
+    // Narkowicz's fit of the ACES curve, then sRGB to a level or two.
+    vec3 x = light * sun_light.w;
+    x = min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0);
+    vec3 s = sqrt(x);
+    return s * (1.1366 - 0.1366 * s);
+}
+
+float fogged() {
+    float far = 1.0 / gl_FragCoord.w;
+    return max(1.0 - exp(-fog.w * far), clamp((far - haze.x) * haze.y, 0.0, haze.z));
 }
 
 void glow(vec3 colour, float label) {
-    float share = clamp((1.0 / gl_FragCoord.w - fog_range.x) * fog_range.y, 0.0, fog.w);
-    pixel = vec4(on_screen(colour * colour, share), label / 255.0);
+    pixel = vec4(mix(colour, on_screen(fog.rgb), fogged()), label / 255.0);
+}
+
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+    float facing = max(dot(normal, sun.xyz), 0.0);
+    vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
+    light += sun_light.rgb * (facing * sunlit(at, normal));
+    pixel = vec4(on_screen(mix(albedo * light + own, fog.rgb, fogged())), label / 255.0);
 }
 
 void show(vec3 albedo, vec3 normal, vec3 at, float label) {
-    float facing = max(dot(normal, sun.xyz), 0.0);
-    vec3 light = mix(ground_light.rgb, sky_light.rgb, 0.5 + 0.5 * normal.z);
-    light += sun_light.rgb * (facing * sunlit(at, normal));
-    float share = clamp((1.0 / gl_FragCoord.w - fog_range.x) * fog_range.y, 0.0, fog.w);
-    pixel = vec4(on_screen(albedo * albedo * light, share), label / 255.0);
+    show_linear(decoded(albedo), vec3(0.0), normal, at, label);
 }
 """
 
@@ -145,8 +166,10 @@ def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: boo
     """
     head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
     return Programs(
-        context.program(vertex_shader=_BLOCK + _VERTEX + vertex, fragment_shader=head + _FRAGMENT + fragment),
-        context.program(vertex_shader=_BLOCK + _VERTEX + vertex, fragment_shader=_NOTHING),
+        context.program(
+            vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=head + _DECODED + _FRAGMENT + fragment
+        ),
+        context.program(vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=_NOTHING),
     )
 
 
@@ -180,7 +203,7 @@ class SceneBlock:
     """The uniform block of a pass."""
 
     def __init__(self, context: moderngl.Context) -> None:
-        self._buffer = context.buffer(reserve=4 * 4 * (4 + 4 + 11))
+        self._buffer = context.buffer(reserve=4 * 4 * (4 + 4 + 12))
 
     def write(self, clip_from_at: Floats, shadow_from_at: Floats, shot: Shot, anchor: Floats, light: Lighting) -> None:
         """Set it for what is drawn next; matrices (4, 4)."""
@@ -188,13 +211,8 @@ class SceneBlock:
         tall = np.tan(0.5 * np.radians(shot.fov_deg))
         wide = tall * shot.size[0] / shot.size[1]
         rows = [
-            (*(shot.eye_m[:2] - anchor), shot.eye_m[2], light.exposure),
-            (*light.to_sun, light.shadows),
-            (*light.sun, 0.0),
-            (*light.sky, 0.0),
-            (*light.ground, 0.0),
-            (*light.fog, light.fog_most),
-            (light.fog_from_m, light.fog_per_m, 0.0, 0.0),
+            (*(shot.eye_m[:2] - anchor), shot.eye_m[2], 0.0),
+            *light.rows(),
             (*anchor, 0.0, 0.0),
             (*right, wide),
             (*up, tall),

@@ -30,9 +30,9 @@ def middle_of(eye_m: Floats) -> Floats:
     return np.asarray(np.round(eye_m[:2] / STEP_M) * STEP_M)
 
 
-def shadow_matrix(middle: Floats, anchor: Floats, to_sun: tuple[float, float, float]) -> Floats:
+def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
     """(4, 4) from metres relative to the anchor to the clip space of the maps."""
-    sun = np.asarray(to_sun) / np.linalg.norm(to_sun)
+    sun = to_sun / np.linalg.norm(to_sun)
     across = np.cross((0.0, 0.0, 1.0), sun)
     across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
     rows = np.stack([across, np.cross(sun, across), -sun])
@@ -70,7 +70,7 @@ class ShadowMaps:
         self._context.enable_only(moderngl.DEPTH_TEST)
         self._context.depth_func = "<"
         self._context.polygon_offset = 1.5, 4.0
-        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun)
+        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)
             self._drawn_for = key

@@ -1,4 +1,4 @@
-"""The ground and buildings of a tile as one static buffer, uploaded once."""
+"""The ground of a tile as one static buffer, uploaded once; its materials are laid over it by world position."""
 
 from __future__ import annotations
 
@@ -9,52 +9,87 @@ import numpy as np
 
 from cosim.geometry import Floats
 from cosim.state import LABELS
-from physics.buildings import FACADES, WINDOWS, facade_meshes
 from physics.gl.corners import LAYOUT, corners, joined
 from physics.gl.shading import Programs, Stage, programs, put
-from physics.ground import Ground
-from physics.tiles import Key, square, surface
+from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.materials import PAVINGS
+from physics.textures.ground import layer_of
+from physics.tiles import Tile, square, surface
 
-_VERTEX: Final = """
+_TINTED: Final = 128
+"""Added to the label of a surface whose colour tints its texture."""
+
+_VERTEX: Final = (
+    KNOWN
+    + """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 uniform vec2 middle;
-out vec3 at; out vec3 normal; out vec3 albedo; flat out float label;
+uniform vec2 middle_in_world;
+out vec3 at; out vec3 normal; out vec2 spot; flat out vec3 tint; flat out vec2 layer_label;
 void main() {
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    float label = in_colour.a * 255.0;
     at = in_at + vec3(middle, 0.0);
     normal = unpacked(in_normal);
-    albedo = in_colour.rgb;
-    label = in_colour.a * 255.0;
+    tint = label > 127.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0);
+    float side = layers[layer].w;
+    spot = fract(middle_in_world / side) + in_at.xy / side;
+    layer_label = vec2(layer, label > 127.5 ? label - 128.0 : label);
     gl_Position = project(at);
 }
 """
+)
 
-_FRAGMENT: Final = """
-in vec3 at; in vec3 normal; in vec3 albedo; flat in float label;
-void main() { show(albedo, normalize(normal), at, label); }
+_FRAGMENT: Final = (
+    LOOKED_UP
+    + """
+in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
+void main() {
+    vec4 seen = texture(surfaces, vec3(spot, layer_label.x));
+    vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
+    show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
+}
 """
+)
+
+
+class TileShaders:
+    """The program of all tiles."""
+
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
+        self.programs: Programs = programs(context, _VERTEX, _FRAGMENT, shadows)
+        self.surfaces = surfaces
+        for program in self.programs:
+            if "layers" in program:
+                program["layers"].write(surfaces.known)  # type: ignore[union-attr]
 
 
 class TileBuffers:
-    """What does not move in one tile. middle: (2,) world metres."""
+    """The ground of one tile. middle: (2,) world metres."""
 
-    def __init__(self, context: moderngl.Context, shaders: Programs, ground: Ground, key: Key):
-        x0, y0, x1, y1 = square(key)
+    def __init__(self, context: moderngl.Context, shaders: TileShaders, tile: Tile, seed: int) -> None:
+        x0, y0, x1, y1 = square(tile.key)
         self.middle: Floats = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-        parts = [(mesh, *surface(name)[::-1]) for name, mesh in ground.tile(key).parts.items()]
-        for facade, mesh in facade_meshes(ground.buildings(key)).items():
-            parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
-        local = [(mesh.moved((*-self.middle, 0.0)), colour, LABELS[label]) for mesh, colour, label in parts]
-        rows, triangles = joined([(mesh, corners(mesh, colour, label)) for mesh, colour, label in local])
-        self._shaders = shaders
+        parts = []
+        for name, mesh in tile.parts.items():
+            label, colour = surface(name)
+            here = mesh.moved((*-self.middle, 0.0))
+            rows = corners(here, colour, LABELS[label] + (_TINTED if name in PAVINGS else 0))
+            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer_of(name, seed))
+            parts.append((here, rows))
+        rows, triangles = joined(parts)
+        self._programs = shaders.programs
         self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
         content = [(self._corners, *LAYOUT)]
         self._arrays = [
-            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders
+            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in self._programs
         ]
 
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if stage != "moving":
-            put(self._shaders.of(stage), "middle", tuple(self.middle - anchor))
+            program = self._programs.of(stage)
+            put(program, "middle", tuple(self.middle - anchor))
+            put(program, "middle_in_world", tuple(self.middle))
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
@@ -62,7 +97,3 @@ class TileBuffers:
             array.release()
         self._corners.release()
         self._triangles.release()
-
-
-def tile_programs(context: moderngl.Context, shadows: bool) -> Programs:
-    return programs(context, _VERTEX, _FRAGMENT, shadows)

@@ -1,0 +1,182 @@
+"""Buildings of a tile as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
+
+What is drawn has the shape that physics.buildings gives it; which wall, which windows and which fronts a building has
+hangs on its name. Each bay of each storey draws its own variant.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.geometry import Floats
+from cosim.state import LABELS
+from physics.buildings import Building, facade_meshes
+from physics.gl.shading import FACADES_UNIT, Programs, Stage, programs, put
+from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.mesh import Mesh
+from physics.textures.facade_canvas import BAY_M, STOREY_M
+from physics.textures.facades import VARIANTS, WALL_STYLES
+
+_CORNER: Final = np.dtype(
+    [
+        ("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4), ("spot", "f4", 4), ("kind", "u1", 4),
+        ("fronts", "u1", 4),
+    ]
+)  # fmt: skip
+"""normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres, in bays and storeys;
+kind: first layer of the upper storeys' windows, storeys, whether it looks to the street, chance;
+fronts: first layers of three fronts, chance."""
+_LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "in_spot", "in_kind", "in_fronts")
+_LEAST_M: Final = 2.2
+"""A narrower wall has no windows."""
+
+_VERTEX: Final = (
+    KNOWN
+    + """
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
+uniform vec2 middle;
+out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
+flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts;
+void main() {
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    at = in_at + vec3(middle, 0.0);
+    normal = unpacked(in_normal);
+    tint = vec4(in_colour.a > 0.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0), layer);
+    spot = in_spot.xy / layers[layer].w;
+    cells = in_spot.zw;
+    kind = in_kind * 255.0;
+    fronts = in_fronts * 255.0;
+    gl_Position = project(at);
+}
+"""
+)
+
+_FRAGMENT: Final = (
+    LOOKED_UP
+    + f"""
+layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
+in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
+flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts;
+float chance(vec2 cell, float of) {{
+    vec2 p = fract((cell + of) * vec2(0.1031, 0.1030));
+    p += dot(p, p.yx + 33.33);
+    return fract((p.x + p.y) * p.x);
+}}
+void main() {{
+    vec4 wall = texture(surfaces, vec3(spot, tint.a));
+    vec3 albedo = decoded(wall.rgb) * mix(vec3(1.0), tint.rgb, wall.a);
+    vec2 cell = floor(cells);
+    float drawn = chance(cell, kind.w + 7.0 * fronts.w);
+    float which = drawn * 3.0;
+    float front = which < 1.0 ? fronts.x : which < 2.0 ? fronts.y : fronts.z;
+    float first = cell.y < 0.5 && kind.z > 0.5 ? front : kind.x;
+    float layer = first + floor(fract(drawn * 17.0) * {VARIANTS}.0);
+    vec4 bay = texture(facades, vec3(cells.x, -cells.y, layer));
+    bool none = cell.y < 0.0 || cell.y >= kind.y;
+    albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
+    show_linear(albedo, vec3(0.0), normal, at, {LABELS["building"]}.0);
+}}
+"""
+)
+
+
+class WallShaders:
+    """The program of all buildings."""
+
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
+        self.programs: Programs = programs(context, _VERTEX, _FRAGMENT, shadows)
+        self.surfaces = surfaces
+        for program in self.programs:
+            if "layers" in program:
+                program["layers"].write(surfaces.known)  # type: ignore[union-attr]
+
+
+class WallBuffers:
+    """The buildings of one tile. middle: (2,) world metres of the tile's."""
+
+    def __init__(
+        self, context: moderngl.Context, shaders: WallShaders, buildings: Sequence[Building], middle: Floats
+    ) -> None:
+        self._programs, self._middle = shaders.programs, middle
+        parts = [rows for building in buildings for rows in _rows(building, shaders.surfaces, middle)]
+        self._arrays: list[moderngl.VertexArray] = []
+        self._buffers: list[moderngl.Buffer] = []
+        if not parts:
+            return
+        starts = np.cumsum([0, *(len(rows) for rows, _ in parts)])
+        indices = [triangles.ravel() + start for (_, triangles), start in zip(parts, starts, strict=False)]
+        held = np.concatenate([rows for rows, _ in parts]), np.concatenate(indices).astype(np.uint32)
+        self._buffers = [context.buffer(array.tobytes()) for array in held]
+        content = [(self._buffers[0], *_LAYOUT)]
+        self._arrays = [
+            context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in self._programs
+        ]
+
+    def draw(self, stage: Stage, anchor: Floats) -> None:
+        if self._arrays and stage != "moving":
+            put(self._programs.of(stage), "middle", tuple(self._middle - anchor))
+            self._arrays[stage != "colour"].render()
+
+    def release(self) -> None:
+        for array in self._arrays:
+            array.release()
+        for buffer in self._buffers:
+            buffer.release()
+
+
+def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
+    """Corners and triangles of a building's walls and roof."""
+    rng = np.random.default_rng(zlib.crc32(building.id.encode()))
+    style = list(WALL_STYLES.values())[int(rng.integers(len(WALL_STYLES)))]
+    layers, bays = surfaces.surfaces, surfaces.facades
+    wall = layers.index(str(rng.choice(style.walls)))
+    roof = layers.index(str(rng.choice(style.roofs)))
+    upper = bays.index(f"{rng.choice(style.uppers)}-0")
+    fronts = [bays.index(f"{name}-0") for name in rng.choice(style.fronts, 3)]
+    colour = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
+    chance = rng.integers(0, 256, 2)
+    street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
+    found = []
+    for facade, mesh in facade_meshes((building,)).items():
+        if facade < 0:
+            continue  # windows of the other camera: here they are painted
+        rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
+        rows["at"] = mesh.vertices - np.array([*middle, 0.0])
+        rows["normal"][:, :3] = np.rint(127.0 * mesh.normals) + 127.0
+        flat = mesh.normals[:, 2] > 0.5
+        rows["normal"][:, 3] = np.where(flat, roof, wall)
+        if colour is not None:
+            rows["colour"] = *np.rint(255.0 * np.array(colour)), 255.0
+            rows["colour"][flat] = 0
+        rows["spot"], storeys = _spots(mesh, flat)
+        rows["kind"] = np.stack(
+            [np.full(len(rows), upper), storeys, mesh.normals @ street > 0.9, np.full(len(rows), chance[0])], 1
+        )
+        rows["fronts"] = *fronts, chance[1]
+        found.append((rows, mesh.triangles))
+    return found
+
+
+def _spots(mesh: Mesh, flat: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
+    """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows."""
+    spots, storeys = np.zeros((len(flat), 4)), np.zeros(len(flat), dtype=np.int64)
+    spots[flat, :2] = mesh.vertices[flat, :2]
+    spots[flat, 3] = -1.0
+    base = mesh.vertices[:, 2].min()
+    walls = np.flatnonzero(~flat).reshape(-1, 4)  # upright faces are quads: four corners after each other
+    for quad in walls:
+        normal = mesh.normals[quad[0]]
+        along = mesh.vertices[quad] @ np.array([-normal[1], normal[0], 0.0])
+        along -= along.min()
+        up = mesh.vertices[quad, 2] - base
+        width = along.max()
+        count = max(round(width / BAY_M), 1)
+        spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
+        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= _LEAST_M else 0
+    return spots, storeys
