@@ -121,6 +121,7 @@ def print_check(check: MapCheck, about: About | None) -> None:
 def _rows(check: MapCheck) -> list[tuple[str, str]]:
     islands = ", ".join(f"{island.share:.1%}" for island in check.islands[:5])
     guessed = "unknown" if check.guessed_share is None else f"{check.guessed_share:.0%} of their length"
+    shown = ", ".join(f"{count} x {kind}" for kind, count in check.features.items())
     return [
         ("walkable", f"{check.walkable_km:.2f} km on {check.sidewalks} sidewalks, {check.corners} corners"),
         ("crossings", f"{check.crossings}, {check.crossing_km:.2f} km; {check.signalised} with signals"),
@@ -134,6 +135,7 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
         ("on the road", f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it"),
         ("over or under a road", f"{check.stacked} sidewalks, with no crossing there"),
         ("guessed sidewalks", guessed),
+        ("shown by the map", shown or "no buildings, no things: all are made up"),
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import msgspec
@@ -90,6 +91,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the sidewalks' area that
     lies on lanes of roads; on_road: sidewalks that do so mostly; stacked: those that cross a road where there is no
     crossing. guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
+    features: how many buildings and things of each kind the map itself shows.
     """
 
     name: str
@@ -118,6 +120,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     reasons: tuple[str, ...]
     notes: tuple[str, ...]
     problems: tuple[Problem, ...]
+    features: dict[str, int]
 
     @property
     def usable(self) -> bool:
@@ -182,6 +185,7 @@ def check_map(
         reasons=tuple(reasons),
         notes=tuple([*unit, *long_horizon, *_notes(facts)] if not reasons else _notes(facts)),
         problems=tuple(marked),
+        features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
 
 

@@ -99,6 +99,25 @@ class Junction:
     signalised: bool
 
 
+FeatureKind = Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"]
+
+
+@dataclass(frozen=True, slots=True)
+class Feature:
+    """A building or a thing on the street that the map itself shows.
+
+    x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a lamp) or right (who
+    sits on a bench). height_m: 0 where the map does not say. polygon: a building's ground; empty for the others.
+    """
+
+    kind: FeatureKind
+    x_m: float
+    y_m: float
+    heading_rad: float = 0.0
+    height_m: float = 0.0
+    polygon: Polygon = field(default_factory=Polygon)
+
+
 class Located(NamedTuple):
     """Where a point is: on a walkable piece, on a lane, or off both; edge: the SUMO edge there."""
 
@@ -114,7 +133,8 @@ Piece = Strip | Corner | Lane | Junction
 class StreetMap:
     """A place. All ids are SUMO edge, lane or junction ids; the mappings are in the net's order.
 
-    bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from.
+    bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the features where
+    there are any. features: what the map shows beside its streets; none of it stands in the way.
     """
 
     name: str
@@ -125,6 +145,7 @@ class StreetMap:
     junctions: Mapping[str, Junction]
     net_hash: str = ""
     left_hand: bool = False
+    features: tuple[Feature, ...] = ()
     _trees: dict[str, tuple[shapely.STRtree, tuple[Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )

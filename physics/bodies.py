@@ -12,7 +12,7 @@ from cosim.errors import EngineError
 from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M, RobotState
-from physics.buildings import Building
+from physics.buildings import Building, Wall
 from physics.furniture import Prop, solids_of
 from physics.materials import friction
 from physics.mesh import Mesh, as_lists, join
@@ -21,6 +21,9 @@ from physics.tiles import CURB_M, Tile
 
 PERSON_M: Final = 1.7
 VEHICLE_M: Final = 1.5
+WALL_M: Final = 0.2
+"""How thick the walls of mapped buildings are."""
+
 FAR_BELOW_M: Final = -50.0
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _TYRE: Final = {
@@ -80,8 +83,8 @@ class Bodies:
         for name, mesh in tile.parts.items():
             of_friction.setdefault(friction(name), []).append(mesh)
         ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
-        things = [self._add_building(b) for b in buildings] + [self._add_prop(prop, z) for prop, z in props]
-        return [*ground, *things]
+        houses = [body for b in buildings for body in self._add_building(b)]
+        return [*ground, *houses, *(self._add_prop(prop, z) for prop, z in props)]
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
@@ -92,13 +95,18 @@ class Bodies:
         self._do("changeDynamics", ground, -1, lateralFriction=value)
         return ground
 
-    def _add_building(self, building: Building) -> int:
-        half = [0.5 * s for s in building.size_m]
-        shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
-        at = (building.x_m, building.y_m, CURB_M + half[2])
-        body = self._body(shape, at, p.getQuaternionFromEuler((0.0, 0.0, building.heading_rad)))
-        self._what[body] = ("wall", building.id)
-        return body
+    def _add_building(self, building: Building) -> list[int]:
+        boxes = [((building.x_m, building.y_m), building.heading_rad, building.size_m)]
+        if building.outline is not None:
+            boxes = [_wall_box(wall, building.size_m[2]) for wall in building.walls]
+        bodies = []
+        for (x, y), heading, size in boxes:
+            half = [0.5 * s for s in size]
+            shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
+            turn = p.getQuaternionFromEuler((0.0, 0.0, heading))
+            bodies.append(self._body(shape, (x, y, CURB_M + half[2]), turn))
+            self._what[bodies[-1]] = ("wall", building.id)
+        return bodies
 
     def _add_prop(self, prop: Prop, z_m: float) -> int:
         pool = (prop.kind, prop.variant)
@@ -239,3 +247,11 @@ class Bodies:
             return getattr(p, call)(*args, **options, physicsClientId=self._client)
         except p.error as error:
             raise EngineError(f"PyBullet: {call}: {error}") from error
+
+
+def _wall_box(wall: Wall, height_m: float) -> tuple[tuple[float, float], float, tuple[float, float, float]]:
+    """Middle, heading and size of a wall: WALL_M thick, its outer face on the line, the outside to the line's right."""
+    x0, y0, x1, y1 = wall
+    length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
+    x, y = 0.5 * (x0 + x1) - 0.5 * WALL_M * math.sin(heading), 0.5 * (y0 + y1) + 0.5 * WALL_M * math.cos(heading)
+    return (x, y), heading, (length, WALL_M, height_m)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 import shapely
@@ -28,6 +28,7 @@ _STOREY_M: Final = 3.2
 _LOT_M: Final = (9.0, 20.0)
 _DEPTH_M: Final = (8.0, 14.0)
 _HEIGHT_M: Final = (6.0, 25.0)
+_WINDOW_WALL_M: Final = 4.0
 
 FACADES: Final = (
     (0.71, 0.45, 0.36), (0.82, 0.74, 0.60), (0.60, 0.62, 0.66),
@@ -36,10 +37,17 @@ FACADES: Final = (
 WINDOWS: Final = (0.23, 0.27, 0.33)
 
 
+Wall = tuple[float, float, float, float]
+"""A wall from (x, y) to (x, y) on the ground, in metres, the outside to its right."""
+
+
 @dataclass(frozen=True, slots=True)
 class Building:
     """A box on the high ground. size_m: along the street, away from it, height. heading_rad: along the sidewalk,
-    the street to its right."""
+    the street to its right.
+
+    A building of the map has an outline and walls of its own; the box is then the one around it.
+    """
 
     id: str
     x_m: float
@@ -47,29 +55,47 @@ class Building:
     heading_rad: float
     size_m: tuple[float, float, float]
     facade: int
+    outline: shapely.Polygon | None = None
+    walls: tuple[Wall, ...] = ()
 
     @property
     def polygon(self) -> shapely.Polygon:
         """The outline on the ground."""
+        if self.outline is not None:
+            return self.outline
         along = 0.5 * self.size_m[0] * np.array([math.cos(self.heading_rad), math.sin(self.heading_rad)])
         away = 0.5 * self.size_m[1] * np.array([-math.sin(self.heading_rad), math.cos(self.heading_rad)])
         middle = np.array([self.x_m, self.y_m])
         return shapely.Polygon(middle + np.array([along + away, away - along, -along - away, along - away]))
 
 
-class Frontage:
-    """The buildings of a map: `in_tile` is a pure function of the map, the seed and the tile, kept once known."""
+class Mapped(Protocol):
+    """What the map shows of buildings."""
 
-    def __init__(self, street_map: StreetMap, seed: int) -> None:
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """Those in a tile, or the parts of them there."""
+
+    def shows(self, kind: str, place: shapely.Geometry) -> bool:
+        """Whether there are things of a kind near a place."""
+
+
+class Frontage:
+    """The buildings of a map: `in_tile` is a pure function of the map, the seed and the tile, kept once known.
+
+    mapped: buildings that the map shows; near them none is made up. None: the map shows none.
+    """
+
+    def __init__(self, street_map: StreetMap, seed: int, mapped: Mapped | None = None) -> None:
         self._map = street_map
         self._seed = seed
+        self._mapped = mapped
         self._rows: dict[str, tuple[Building, ...]] = {}
 
     def in_tile(self, key: Key) -> tuple[Building, ...]:
         """Buildings whose centre lies in the tile, in the net's order."""
         x0, y0, x1, y1 = square(key)
         reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
-        found: list[Building] = []
+        found = [] if self._mapped is None else list(self._mapped.buildings(key))
         for strip in self._map.near("strip", reach):
             if isinstance(strip, Strip) and strip.kind == "sidewalk" and strip.road_side != 0:
                 if strip.id not in self._rows:
@@ -115,6 +141,8 @@ class Frontage:
         return None
 
     def _clear(self, building: Building) -> bool:
+        if self._mapped is not None and self._mapped.shows("building", building.polygon):
+            return False
         area = shapely.buffer(building.polygon, MARGIN_M, join_style="mitre")
         kinds: tuple[PieceKind, ...] = ("strip", "corner", "junction", "lane")
         return not any(p for kind in kinds for p in self._map.near(kind, area) if not _is_verge(p))
@@ -133,12 +161,42 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
     """Walls and roofs by facade; -1 for the windows and doors on the side towards the street."""
     walls: dict[int, list[Mesh]] = {}
     for b in buildings:
+        if b.outline is not None:
+            walls.setdefault(b.facade, []).append(_outlined(b, b.outline))
+            walls.setdefault(-1, []).append(_windows(b))
+            continue
         width, deep, height = b.size_m
         body = box((width, deep, height), (0.0, 0.0, 0.5 * height), skip=("bottom",))
         at = (b.x_m, b.y_m, CURB_M)
         walls.setdefault(b.facade, []).append(body.moved(at, b.heading_rad))
         walls.setdefault(-1, []).append(_openings(b).moved(at, b.heading_rad))
     return {facade: join(meshes) for facade, meshes in sorted(walls.items())}
+
+
+def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
+    """Walls and the flat roof of a building of the map."""
+    x0, y0, x1, y1 = np.array(building.walls).reshape(-1, 4).T
+    low, high = np.full(len(x0), CURB_M), np.full(len(x0), CURB_M + building.size_m[2])
+    at = [np.column_stack(corner) for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))]
+    corners = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
+    roof = corners.reshape(-1, 4, 2)[:, :3]
+    one, two = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
+    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
+    roof[under] = roof[under][:, ::-1]
+    top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), high[0] if len(high) else building.size_m[2])])
+    up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
+    return join([quads(np.stack(at, axis=1)), Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3))])
+
+
+def _windows(building: Building) -> Mesh:
+    """Windows in the walls of a building of the map, with a door in those long enough for one."""
+    found = []
+    for x0, y0, x1, y1 in building.walls:
+        length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
+        if length >= _WINDOW_WALL_M:
+            wall = Building("", 0.0, 0.0, 0.0, (length, 0.0, building.size_m[2]), 0)
+            found.append(_openings(wall).moved((0.5 * (x0 + x1), 0.5 * (y0 + y1), CURB_M), heading))
+    return join(found)
 
 
 def _openings(building: Building) -> Mesh:

@@ -15,6 +15,7 @@ from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, Frontage
 from physics.furniture import Prop
+from physics.mapped import MappedThings
 from physics.materials import Paving
 from physics.placement import Placement
 from physics.robots import RobotModel
@@ -35,9 +36,10 @@ class Ground:
         self.street_map = street_map
         self.seed = seed
         self.roughness = roughness
-        self._frontage = Frontage(street_map, seed)
+        mapped = MappedThings(street_map)
+        self._frontage = Frontage(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
-        self._placement = Placement(street_map, seed, self._frontage)
+        self._placement = Placement(street_map, seed, self._frontage, mapped)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
 
     def tile(self, key: Key) -> Tile:

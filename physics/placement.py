@@ -20,6 +20,7 @@ from cosim.geometry import Polyline
 from cosim.streetmap import Lane, PieceKind, StreetMap, Strip
 from physics.buildings import Frontage
 from physics.furniture import CATALOGUE, KINDS, VARIANTS, Kind, Prop, Zone, footprints
+from physics.mapped import MappedThings
 from physics.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
 
 CLEAR_HALF_M: Final = 0.6
@@ -59,10 +60,13 @@ class _Band(NamedTuple):
 class Placement:
     """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once known."""
 
-    def __init__(self, street_map: StreetMap, seed: int, frontage: Frontage) -> None:
+    def __init__(
+        self, street_map: StreetMap, seed: int, frontage: Frontage, mapped: MappedThings | None = None
+    ) -> None:
         self._map = street_map
         self._seed = seed
         self._frontage = frontage
+        self._mapped = MappedThings(street_map) if mapped is None else mapped
         self._drawn: dict[str, tuple[list[Prop], NDArray[np.object_]]] = {}
         self._kept: dict[str, tuple[Prop, ...]] = {}
         self._houses: dict[Key, list[shapely.Geometry]] = {}
@@ -71,7 +75,7 @@ class Placement:
         """Props whose middle lies in the tile, in the net's order."""
         strips = self._map.near("strip", shapely.box(*_grown(square(key), _REACH_M)))
         props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
-        return tuple(prop for prop in props if key_at(prop.x_m, prop.y_m) == key)
+        return (*self._mapped.props(key), *(prop for prop in props if key_at(prop.x_m, prop.y_m) == key))
 
     def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
         """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk has drawn."""
@@ -82,16 +86,18 @@ class Placement:
                 area = shapely.box(*_grown(shapely.total_bounds(ground), _REACH_M))
                 others = [s for s in self._map.near("strip", area) if isinstance(s, Strip) and s.id < strip.id]
                 rivals = [polygon for s in others for polygon in self._draw(s)[1]]
+                rivals += list(footprints(self._mapped_in(area)))
                 hit |= _meets(ground, rivals, GAP_M)
                 spread = np.array([KINDS[prop.kind].spread_m for prop in props])
                 hit |= _meets(shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M)
             self._kept[strip.id] = tuple(prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit)
         return self._kept[strip.id]
 
+    def _mapped_in(self, area: shapely.Polygon) -> list[Prop]:
+        return [prop for key in _keys_of(area) for prop in self._mapped.props(key)]
+
     def _houses_in(self, area: shapely.Polygon) -> list[shapely.Geometry]:
-        x0, y0, x1, y1 = shapely.bounds(area).tolist()
-        (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
-        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+        keys = _keys_of(area)
         for key in keys:
             if key not in self._houses:
                 self._houses[key] = [b.polygon for b in self._frontage.in_tile(key)]
@@ -101,6 +107,7 @@ class Placement:
         """Props of a sidewalk that fit its zones, the street and each other, and their footprints."""
         if strip.id not in self._drawn:
             props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
+            props = [p for p in props if not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))]
             ground = footprints(props)
             if props:
                 free = _fits(self._map, strip, props, ground)
@@ -198,8 +205,10 @@ def street_style(street_class: str) -> str:
 
 def standing(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
     """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
-    placement = Placement(street_map, seed, Frontage(street_map, seed))
-    return tuple(prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
+    mapped = MappedThings(street_map)
+    placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
+    made_up = (prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
+    return (*mapped.all_props, *made_up)
 
 
 def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
@@ -253,6 +262,13 @@ def _meets(ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m
 def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
     """Whether something stands on a driveway or on the ramp to it."""
     return abs(at_m - driveway_m) < 0.5 * (DRIVEWAY_M + length_m) + RAMP_M
+
+
+def _keys_of(area: shapely.Geometry) -> list[Key]:
+    """The tiles that the bounds of an area touch."""
+    x0, y0, x1, y1 = shapely.bounds(area).tolist()
+    (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+    return [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
 
 
 def _room(band: _Band) -> float:

@@ -29,7 +29,7 @@ from scenarios.barriers import fenced
 from scenarios.behaviors import react
 from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
-from sumo_nets.mapstore import map_net
+from sumo_nets.mapstore import map_net, read_map
 from sumo_nets.store import city_net
 
 CORRIDOR_M = 40.0
@@ -103,5 +103,7 @@ def directed(env: str) -> Iterator[Director]:
 @lru_cache(maxsize=1)
 def place(where: Place) -> tuple[Path, StreetMap]:
     """The net of a place and what was read from it; the last one is kept."""
-    path = city_net(where) if isinstance(where, City) else map_net(where)
-    return path, street_map_of(path)
+    if isinstance(where, City):
+        path = city_net(where)
+        return path, street_map_of(path)
+    return map_net(where), read_map(where)

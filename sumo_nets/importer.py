@@ -18,10 +18,13 @@ import shapely
 
 from cosim.errors import MapError, UsageError
 from cosim.mapcheck import NetFacts
+from cosim.streetmap import Feature
 from sumo_nets.cornermend import mend_corners
 from sumo_nets.drivingside import left_hand_country
+from sumo_nets.featurefit import fitted
 from sumo_nets.netfacts import allows, facts_of, footway, net_root, read_facts
 from sumo_nets.netfile import netconvert, read_net
+from sumo_nets.osmfeatures import osm_features
 from sumo_nets.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.signalcheck import mend_signals
 
@@ -78,12 +81,15 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Converted:
-    """A net ready to be kept. changes: what the importer did to it, a sentence each. guessed_share: of the length of
-    the pavements, the part no mapper has seen; None when it cannot be known.
+    """A net ready to be kept, and what the map shows beside its streets.
+
+    changes: what the importer did to it, a sentence each. guessed_share: of the length of the pavements, the part no
+    mapper has seen; None when it cannot be known.
     """
 
     net: Path
     facts: NetFacts
+    features: tuple[Feature, ...]
     format: str
     packing: str
     changes: tuple[str, ...]
@@ -169,7 +175,12 @@ def _finish(
     if facts.twisted_areas:
         changes.append(f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: repaired when read")
     _start_sumo(file, final)
-    return Converted(final, facts, file.format, file.packing, tuple(changes), share, tuple(licences))
+    features: tuple[Feature, ...] = ()
+    if file.format == "osm":
+        location = root.find("location")
+        features, told = fitted(osm_features(file), {} if location is None else location.attrib, street_map)
+        changes += told
+    return Converted(final, facts, features, file.format, file.packing, tuple(changes), share, tuple(licences))
 
 
 def _left_hand(found: OsmFacts, options: Options, changes: list[str]) -> bool:

@@ -19,12 +19,14 @@ from cosim.errors import MapError, UsageError, unknown
 from cosim.mapcheck import MapCheck, check_map
 from cosim.scenario import CityMap
 from cosim.streetmap import StreetMap
+from sumo_nets.atlas import street_map_of
+from sumo_nets.featurefile import NAME, read_features, with_features, write_features
 from sumo_nets.importer import Options, convert
 from sumo_nets.netfacts import read_facts
-from sumo_nets.netfile import net_content_hash, read_net
+from sumo_nets.netfile import net_content_hash
 from sumo_nets.store import cache_folder
 
-IMPORTER = 1
+IMPORTER = 2
 """Version of the importer: another one for every change that changes an imported net."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
 """File names that name no place: the folder's name is taken instead."""
@@ -97,18 +99,26 @@ def map_net(place: CityMap | str) -> Path:
         if name not in games:
             raise unknown("map", name, known_maps())
         _keep(games[name], name, Options())
-    if not isinstance(place, str) and place.net_hash and (found := net_content_hash(path)) != place.net_hash:
+    if not isinstance(place, str) and place.net_hash and (found := map_hash(path)) != place.net_hash:
         raise MapError(
-            f"map '{name}': the net's hash is {found}, but the scenario was made on {place.net_hash}: import the same "
+            f"map '{name}': its hash is {found}, but the scenario was made on {place.net_hash}: import the same "
             "file with the same options and versions again, or make the scenarios anew"
         )
     return path
 
 
 def read_map(place: CityMap | str) -> StreetMap:
-    """The StreetMap of a map, under the map's name."""
+    """The StreetMap of a map, under the map's name, with what the map shows beside its streets."""
     name = place if isinstance(place, str) else place.map
-    return dataclasses.replace(read_net(map_net(place)), name=name)
+    path = map_net(place)
+    street_map, features = street_map_of(path), read_features(path.with_name(NAME))
+    known_as = with_features(street_map.net_hash, path.with_name(NAME))
+    return dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
+
+
+def map_hash(net: Path) -> str:
+    """Content hash of a map by its net: of the net, and of the features beside it where there are any."""
+    return with_features(net_content_hash(net), net.with_name(NAME))
 
 
 def about_map(name: str) -> About:
@@ -145,6 +155,8 @@ def _keep(source: Path, name: str, options: Options) -> About:
             ready = Path(scratch) / "ready"
             ready.mkdir()
             made.net.rename(ready / "net.xml")
+            if made.features:
+                write_features(made.features, ready / NAME)
             about = About(
                 name=name,
                 source=source.name,
@@ -158,7 +170,7 @@ def _keep(source: Path, name: str, options: Options) -> About:
                 changes=made.changes,
                 guessed_share=made.guessed_share,
                 licences=_licences(source, made.licences),
-                net_hash=net_content_hash(ready / "net.xml"),
+                net_hash=map_hash(ready / "net.xml"),
             )
             (ready / "about.json").write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
             _replace(ready, folder / name, Path(scratch))
