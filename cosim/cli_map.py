@@ -1,4 +1,4 @@
-"""The command line of places: `cosim map import`, `check`, `list`."""
+"""The command line of places: `cosim map import`, `check`, `endure`, `list`."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import msgspec
 import typer
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from cosim.box import box_of
@@ -86,6 +87,36 @@ def check(
         if picture is not None:
             out.print(f"Picture: {picture}", soft_wrap=True)
     if not found.usable:
+        raise typer.Exit(1)
+
+
+@map_app.command(
+    epilog="Examples:  \n`cosim map endure bologna`  \n`cosim map endure bologna wildau --minutes 30 --seed 1`"
+)
+def endure(
+    maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps of `cosim map list`.")],
+    minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,
+) -> None:
+    """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit code 1: SUMO died."""
+    from cosim.clock import Clock
+    from cosim.scenario import CityMap
+    from scenarios.endure import endure as endured_on
+    from sumo_nets.mapstore import map_net
+
+    for name in maps:
+        map_net(name)
+    table = Table("map", "simulated min", "persons", "vehicles", "wall s", "ended by", box=box.SIMPLE_HEAD)
+    failed = False
+    for name in maps:
+        with err.status(f"{minutes:g} min on {name} ..."):
+            done = endured_on(CityMap(map=name), seed, minutes)
+        failed |= bool(done.reason)
+        simulated_min = Clock().time_s(done.ticks) / 60.0
+        cells = (f"{simulated_min:.1f}", f"{done.persons:.0f}", f"{done.vehicles:.0f}", f"{done.wall_s:.0f}")
+        table.add_row(name, *cells, escape(done.reason or "its time"))
+    out.print(table)
+    if failed:
         raise typer.Exit(1)
 
 

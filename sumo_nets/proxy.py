@@ -8,10 +8,11 @@ the place changes. Other ways of moving a person (free mapping, a walk of one wa
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
 import shapely
+from shapely.geometry import LineString
 
 from cosim.geometry import Pose, heading_to_sumo
 from cosim.streetmap import Located, StreetMap
@@ -25,6 +26,12 @@ KEEP_ROUTE_ON_ROAD = 7
 MATCH_M = 100.0
 END_M = 2.0
 """Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the corner."""
+
+NEARER_M = 0.01
+"""By how much the lines of its own place must be nearer to a proxy than those of others."""
+
+NUDGES = (0.0, 0.1, 0.2, 0.4, 0.7, 0.98)
+"""Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to others."""
 
 
 class Walk(NamedTuple):
@@ -49,6 +56,9 @@ class Walks:
         self._into: dict[str, list[str]] = {}
         self._at: dict[str, list[str]] = {}
         self._best: dict[str, Walk | None] = {}
+        self._line: Callable[[str], shapely.Geometry] = lambda edge: _line(engine, edge)
+        self._inner = _inner_pieces(engine.edge.getIDList())
+        self._lines: dict[Walk, tuple[shapely.Geometry, shapely.Geometry] | None] = {}
         for strip in street_map.strips.values():
             if strip.kind == "sidewalk":
                 ends = (engine.edge.getFromJunction(strip.id), engine.edge.getToJunction(strip.id))
@@ -81,6 +91,36 @@ class Walks:
         if edge in self._ends:
             return self._pair(self._ahead(edge, pose), [edge], edge)
         return None
+
+    def seen_at(self, walk: Walk, x_m: float, y_m: float) -> tuple[float, float] | None:
+        """The place nearest to a point, in metres, at which SUMO can see a proxy with a walk; None without any.
+
+        Where the corners of a junction are not joined by crossings, SUMO may take a proxy on one to be on another.
+        """
+        if walk not in self._lines:
+            self._lines[walk] = self._own_and_others(walk)
+        lines = self._lines[walk]
+        if lines is None:
+            return x_m, y_m
+        own, others = lines
+        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
+        for share in NUDGES:
+            x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
+            if shapely.distance(own, at := shapely.Point(x, y)) + NEARER_M < shapely.distance(others, at):
+                return x, y
+        return None
+
+    def _own_and_others(self, walk: Walk) -> tuple[shapely.Geometry, shapely.Geometry] | None:
+        """The lines that SUMO compares with a proxy's position: of its walk and place, of the junction's other places.
+
+        None where there are no others.
+        """
+        inner = self._inner.get(self._ends[walk.first][1], [])
+        others = [piece for piece in inner if self._place.get(piece) != walk.around]
+        if not others:
+            return None
+        own = [walk.first, walk.second, *(piece for piece in inner if self._place.get(piece) == walk.around)]
+        return shapely.union_all([*map(self._line, own)]), shapely.union_all([*map(self._line, others)])
 
     def _pair(self, around: str, firsts: list[str], edge: str) -> Walk | None:
         """The walk that touches most corners of `edge`, if possible not from one side of a street to its other."""
@@ -143,13 +183,17 @@ class Proxy:
             walk = None
         elif walk is None or not self._walks.serves(walk, place.edge, pose):
             walk = self._walks.choose(place.edge, pose)
+        mode = KEEP_ROUTE_ON_ROAD if place.kind == "road" else KEEP_ROUTE
+        at = (x_m, y_m)
+        if walk is not None and mode == KEEP_ROUTE:
+            seen_at = self._walks.seen_at(walk, x_m, y_m)
+            walk, at = (None, at) if seen_at is None else (walk, seen_at)
         if walk != self._walk or self._name is None:
             self.remove()
             if walk is not None:
                 self._add(walk)
         if self._name is not None:
-            mode = KEEP_ROUTE_ON_ROAD if place.kind == "road" else KEEP_ROUTE
-            self._engine.person.moveToXY(self._name, "", x_m, y_m, heading_to_sumo(heading_rad), mode, MATCH_M)
+            self._engine.person.moveToXY(self._name, "", *at, heading_to_sumo(heading_rad), mode, MATCH_M)
 
     def remove(self) -> None:
         """Take it out of the simulation."""
@@ -183,6 +227,20 @@ class Proxy:
 def junction_of(internal: str) -> str:
     """The junction of a walking area, crossing or internal edge: "a_b" of ":a_b_w0"."""
     return internal[1:].rsplit("_", 1)[0]
+
+
+def _inner_pieces(edges: Iterable[str]) -> dict[str, list[str]]:
+    """Junction -> its walking areas and crossings, those included that are too small for the map."""
+    inner: dict[str, list[str]] = {}
+    for edge in edges:
+        if edge.startswith(":") and edge.rsplit("_", 1)[1][0] in "wc":
+            inner.setdefault(junction_of(edge), []).append(edge)
+    return inner
+
+
+def _line(engine: Any, edge: str) -> shapely.Geometry:
+    """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a walking area."""
+    return LineString([point[:2] for point in engine.lane.getShape(f"{edge}_0")])
 
 
 def _meeting_places(street_map: StreetMap) -> dict[str, str]:

@@ -19,7 +19,7 @@ from cosim.state import RobotState, Street
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from sumo_nets.crowd import SumoCrowd
-from sumo_nets.netfile import read_net
+from sumo_nets.netfile import netconvert, read_net
 from sumo_nets.store import build_city
 
 pytestmark = pytest.mark.engine
@@ -286,6 +286,26 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
             ]
             street = crowd.step(at(Pose(*bodies[0])), reply(tick, *actors))
         assert np.isfinite(street.people.xy).all() and np.isfinite(street.vehicles.xy).all()
+
+
+def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
+    """Bodies that jump about where footpaths meet in two corners side by side do no harm: SUMO confuses the two."""
+    at_m = {"j": (0, 0), "a": (60, 18), "b": (-6, -3), "c": (-4, 3.5)}
+    paths = [f"{a}{b}" for other in "abc" for a, b in ((other, "j"), ("j", other))]
+    nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "paths.net.xml"))
+    nodes.write_text("<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>")
+    edge = '<edge id="{0}{1}" from="{0}" to="{1}" numLanes="1" allow="pedestrian" width="3.2"/>'
+    edges.write_text("<e>" + "".join(edge.format(*path) for path in paths) + "</e>")
+    netconvert(["-n", str(nodes), "-e", str(edges), "--walkingareas"], net)
+    street_map = read_net(net)
+    assert {corner.id for corner in street_map.corners.values()} >= {":j_w0", ":j_w1"}
+    rng = np.random.default_rng(4)
+    spots = rng.uniform((-5, -5, -math.pi), (12, 12, math.pi), (2000, 2, 3)).tolist()
+    with SumoCrowd(net, street_map, CrowdSpec(persons=4, vehicles=0), 9, OPEN, (0.0, 0.0)) as crowd:
+        for tick, (robot, (x, y, heading)) in enumerate(spots):
+            actor = Actor(id="e0", x_m=x, y_m=y, heading_rad=heading, speed_mps=1.2, doing="walk")
+            crowd.step(at(Pose(*robot)), reply(tick, actor))
+        assert crowd.street.tick == 2000
 
 
 def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
