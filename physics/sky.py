@@ -33,6 +33,7 @@ _CLEAR_M: Final = 30_000.0
 _FOG_TOP_M: Final = 60.0
 _ADAPTED: Final = 0.85
 """A camera, and an eye, make up for most of the dark, not for all of it: the power of the light that is undone."""
+_KEY: Final = 0.85
 _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
@@ -133,7 +134,7 @@ def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: floa
     side = np.mean([irradiance(whole, np.array(way)) for way in compass], axis=0) + 0.7 * lamps * _LAMPS
     # What a camera meters: a bright ground, and some of the sky over the street.
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
-    exposure = 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
+    exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
     ambient = np.stack([up, side, ground])
     whole += np.where(above, glare, 0.0).astype(np.float32)

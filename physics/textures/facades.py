@@ -18,8 +18,8 @@ VARIANTS: Final = 3
 
 
 @lru_cache(maxsize=4)
-def facade_layers(size_px: int = 512, seed: int = 0) -> Layers:
-    """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors."""
+def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
+    """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12 mm each."""
     styles = {**WINDOWS, **FRONTS}
     recipes = {
         f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style))
@@ -40,9 +40,10 @@ def _drawn(style: Callable[[Canvas], None]) -> Callable[[Noise], Picture]:
 
 @dataclass(frozen=True, slots=True)
 class WallStyle:
-    """What a kind of building shows. walls, uppers, fronts: names of wall layers and of styles of bays (with -0 to
-    -2 behind them), of which each building takes one wall, one upper and a few fronts. roofs: wall layers too.
-    tints: sRGB colours of the wall; empty: the wall's own."""
+    """What a kind of building shows. walls, roofs: names of wall layers; uppers, fronts: styles of bays, with a
+    number behind them in the layers. A building takes one wall, one roof, one upper style whose number changes from
+    bay to bay, and a few fronts of one number, so that its shops match. tints: sRGB colours of the wall, of which it
+    takes one; empty: the wall's own colour."""
 
     walls: tuple[str, ...]
     uppers: tuple[str, ...]
@@ -60,40 +61,71 @@ _PASTELS: Final = (
 
 WALL_STYLES: Final[Mapping[str, WallStyle]] = {
     "plaster-old": WallStyle(
-        ("plaster-smooth", "plaster-stained", "plaster-crazed"), ("casement", "shutters", "french", "sash"),
-        _SHOPS, ("roof-tiles", "roof-slate"), _PASTELS,
+        walls=("plaster-smooth", "plaster-stained", "plaster-crazed"),
+        uppers=("casement", "casement-brown", "shutters", "shutters-brown", "french", "sash"),
+        fronts=_SHOPS,
+        roofs=("roof-tiles", "roof-slate"),
+        tints=_PASTELS,
     ),
     "plaster-new": WallStyle(
-        ("plaster-smooth", "plaster-rough"), ("square", "wide", "french", "pair"), _HOMES, ("roof-gravel", "roof-felt"),
-        _PASTELS,
+        walls=("plaster-smooth", "plaster-rough"),
+        uppers=("square", "square-white", "wide", "french-dark", "pair"),
+        fronts=_HOMES,
+        roofs=("roof-gravel", "roof-felt"),
+        tints=_PASTELS,
     ),
     "brick-old": WallStyle(
-        ("brick-flemish", "brick-english", "brick-pale"), ("sash", "arched", "pair"), (*_SHOPS, "home"),
-        ("roof-slate", "roof-tiles"),
+        walls=("brick-flemish", "brick-english", "brick-pale"),
+        uppers=("sash", "sash-fine", "arched", "pair", "pair-green"),
+        fronts=(*_SHOPS, "home"),
+        roofs=("roof-slate", "roof-tiles"),
     ),
     "brick-new": WallStyle(
-        ("brick-stretcher", "brick-dark", "brick-pale"), ("square", "wide", "french"), _HOMES,
-        ("roof-gravel", "roof-felt"),
+        walls=("brick-stretcher", "brick-dark", "brick-pale"),
+        uppers=("square", "square-white", "wide", "french-dark"),
+        fronts=_HOMES,
+        roofs=("roof-gravel", "roof-felt"),
     ),
-    "brick-painted": WallStyle(("brick-painted",), ("sash", "casement", "shutters"), _SHOPS, ("roof-slate",), _PASTELS),
+    "brick-painted": WallStyle(
+        walls=("brick-painted",),
+        uppers=("sash-fine", "casement", "shutters"),
+        fronts=_SHOPS,
+        roofs=("roof-slate",),
+        tints=_PASTELS,
+    ),
     "stone": WallStyle(
-        ("stone-ashlar", "stone-rubble"), ("casement", "arched", "sash"), _SHOPS, ("roof-slate", "roof-metal")
+        walls=("stone-ashlar", "stone-rubble"),
+        uppers=("casement", "casement-brown", "arched", "sash"),
+        fronts=_SHOPS,
+        roofs=("roof-slate", "roof-metal"),
     ),
     "office": WallStyle(
-        ("concrete-panels", "metal-panels", "tiles-glazed"), ("ribbon", "office", "wide"), ("lobby", "shop", "lobby"),
-        ("roof-gravel",), ((0.72, 0.71, 0.69), (0.58, 0.59, 0.61), (0.66, 0.62, 0.56)),
+        walls=("concrete-panels", "metal-panels", "tiles-glazed"),
+        uppers=("ribbon", "office", "office-light", "wide"),
+        fronts=("lobby", "shop", "lobby"),
+        roofs=("roof-gravel",),
+        tints=((0.72, 0.71, 0.69), (0.58, 0.59, 0.61), (0.66, 0.62, 0.56)),
     ),
     "slab": WallStyle(
-        ("concrete-panels", "concrete-boarded"), ("balcony", "wide", "pair"), ("entrance", "home", "blank"),
-        ("roof-felt", "roof-gravel"), ((0.70, 0.69, 0.66), (0.76, 0.72, 0.64), (0.64, 0.66, 0.68)),
+        walls=("concrete-panels", "concrete-boarded"),
+        uppers=("balcony", "balcony-railed", "wide", "pair"),
+        fronts=("entrance", "home", "blank"),
+        roofs=("roof-felt", "roof-gravel"),
+        tints=((0.70, 0.69, 0.66), (0.76, 0.72, 0.64), (0.64, 0.66, 0.68)),
     ),
     "wood": WallStyle(
-        ("wood-siding", "wood-upright"), ("casement", "sash", "square"), ("home", "entrance", "home"),
-        ("roof-tiles", "roof-slate"),
-        ((0.62, 0.54, 0.43), (0.80, 0.79, 0.76), (0.52, 0.30, 0.25), (0.50, 0.56, 0.58), (0.72, 0.66, 0.46)),
+        walls=("wood-siding", "wood-upright"),
+        uppers=("sash", "sash-fine", "square-white", "pair-green"),
+        fronts=("home", "entrance", "home"),
+        roofs=("roof-tiles", "roof-slate"),
+        tints=((0.62, 0.54, 0.43), (0.80, 0.79, 0.76), (0.52, 0.34, 0.29), (0.54, 0.58, 0.59), (0.72, 0.67, 0.52)),
     ),
     "shed": WallStyle(
-        ("metal-corrugated", "metal-panels"), ("blank-upper", "ribbon"), ("garage", "blank", "garage"), ("roof-metal",),
-        ((0.62, 0.64, 0.66), (0.48, 0.55, 0.60), (0.70, 0.68, 0.62)),
+        walls=("metal-corrugated", "metal-panels"),
+        uppers=("blank-upper", "ribbon"),
+        fronts=("garage", "blank", "garage"),
+        roofs=("roof-metal",),
+        tints=((0.62, 0.64, 0.66), (0.52, 0.57, 0.60), (0.70, 0.68, 0.62)),
     ),
-}  # fmt: skip
+}
+"""Kinds of buildings."""

@@ -10,7 +10,7 @@ import numpy as np
 from physics.textures.facade_canvas import BAY_M, STOREY_M, Canvas
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
-from physics.textures.windows import FRAMES, opening, pane, sill, surround
+from physics.textures.panes import WHITE, opening, pane, sill, surround
 
 _FASCIAS: Final[tuple[Colour, ...]] = (
     (0.20, 0.28, 0.27), (0.34, 0.20, 0.19), (0.22, 0.26, 0.35), (0.30, 0.29, 0.27), (0.72, 0.68, 0.60),
@@ -21,7 +21,11 @@ _DOORS: Final[tuple[Colour, ...]] = (
     (0.25, 0.32, 0.28), (0.37, 0.24, 0.17), (0.20, 0.23, 0.30), (0.42, 0.19, 0.17), (0.24, 0.24, 0.25),
     (0.50, 0.40, 0.28),
 )  # fmt: skip
-_PLINTH: Final = (0.46, 0.45, 0.43)
+_GOODS: Final[tuple[Colour, ...]] = (
+    (0.72, 0.68, 0.60), (0.55, 0.42, 0.32), (0.42, 0.47, 0.50), (0.60, 0.36, 0.30), (0.40, 0.46, 0.38),
+    (0.66, 0.58, 0.42), (0.30, 0.33, 0.40), (0.78, 0.76, 0.72),
+)  # fmt: skip
+_PLINTH_M: Final = 0.42
 
 
 def _pick(canvas: Canvas, colours: tuple[Colour, ...]) -> Colour:
@@ -32,28 +36,28 @@ def _scaled(colour: Colour, by: float) -> Colour:
     return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
 
 
-def _plinth(canvas: Canvas, high: float = 0.35) -> None:
-    canvas.box(0.0, BAY_M, 0.0, high, _PLINTH)
-    canvas.box(0.0, BAY_M, high - 0.03, high, _scaled(_PLINTH, 1.15))
-    canvas.shade(0.0, BAY_M, 0.0, 0.10, 0.3)
+def _plinth(canvas: Canvas) -> None:
+    """The foot of the wall: the wall itself, darker, with a ledge; dirt splashed up from the ground."""
+    canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
+    canvas.box(0.0, BAY_M, _PLINTH_M - 0.03, _PLINTH_M, (0.60, 0.59, 0.56), 0.5)
+    canvas.shade(0.0, BAY_M, 0.0, 0.12, 0.35)
 
 
 def _display(canvas: Canvas, x0: float, x1: float, z0: float, z1: float) -> None:
     """A shop window: a warm room, shelves and goods as soft blocks, the street mirrored on it."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
-    warm = linear((0.50, 0.44, 0.36))
+    warm = linear((0.68, 0.62, 0.54))
     depth = 0.35 + 0.65 * np.exp(-(((up - 0.85) / 0.3) ** 2)) * (0.9 + 0.1 * np.cos(9.0 * across))
     colour = np.broadcast_to(0.55 * warm * depth[..., None], (*cover.shape, 3)).copy()
     for shelf in (0.08, 0.38):
         x = rng.uniform(0.02, 0.08)
         while x < 0.95:
             wide, high = rng.uniform(0.04, 0.13), rng.uniform(0.07, 0.24)
-            base = 0.30 + 0.30 * rng.random()
-            hue = np.clip(base + rng.normal(0.0, 0.07, 3), 0.1, 0.75)
+            hue = np.asarray(_GOODS[int(rng.integers(len(_GOODS)))]) * rng.uniform(0.7, 1.1)
             inside = step(x - 0.01, x, across) * (1.0 - step(x + wide, x + wide + 0.01, across))
             inside = inside * step(shelf - 0.01, shelf, up) * (1.0 - step(shelf + high, shelf + high + 0.01, up))
-            colour += (0.7 * linear(hue) - colour) * inside[..., None]
+            colour += (0.8 * linear(hue) - colour) * inside[..., None]
             x += wide + rng.uniform(0.01, 0.12)
         board = step(shelf - 0.03, shelf - 0.025, up) * (1.0 - step(shelf - 0.008, shelf, up)) * np.ones_like(across)
         colour += (linear((0.34, 0.30, 0.26)) - colour) * board[..., None]
@@ -120,7 +124,7 @@ def _awning(canvas: Canvas, z0: float, z1: float) -> None:
 
 def _shop_awning(canvas: Canvas) -> None:
     _shop(canvas)
-    _awning(canvas, 2.12, 2.78)
+    _awning(canvas, 1.98, 2.56)
 
 
 def _cafe(canvas: Canvas) -> None:
@@ -157,22 +161,22 @@ def _entrance(canvas: Canvas) -> None:
     canvas.box(x0 - 0.2, x1 + 0.2, 0.0, 0.1, (0.62, 0.61, 0.58))
     canvas.box(2.36, 2.46, 1.25, 1.55, (0.60, 0.59, 0.56))
     if canvas.rng.random() < 0.6:
-        opening(canvas, 0.12, 0.6, 1.3, 2.3, FRAMES[0])
+        opening(canvas, 0.12, 0.6, 1.3, 2.3, WHITE)
 
 
 def _home(canvas: Canvas) -> None:
-    _plinth(canvas, 0.45)
+    _plinth(canvas)
     x0, x1 = 0.85, 2.15
-    opening(canvas, x0, x1, 1.0, 2.5, FRAMES[int(canvas.rng.integers(len(FRAMES)))], (2, 1))
+    opening(canvas, x0, x1, 1.0, 2.5, WHITE, (2, 1))
     sill(canvas, x0, x1, 1.0)
-    if canvas.rng.random() < 0.4:
+    if canvas.rng.random() < 0.25:
         for x in np.arange(x0 + 0.1, x1, 0.13):
             canvas.box(float(x) - 0.01, float(x) + 0.01, 1.02, 2.42, (0.14, 0.14, 0.15))
         canvas.box(x0, x1, 1.7, 1.72, (0.14, 0.14, 0.15))
 
 
 def _garage(canvas: Canvas) -> None:
-    _plinth(canvas, 0.25)
+    _plinth(canvas)
     colour = _pick(canvas, ((0.62, 0.62, 0.61), (0.40, 0.42, 0.44), (0.46, 0.38, 0.30), (0.70, 0.69, 0.65)))
     canvas.box(0.22, 2.78, 0.0, 2.5, (0.22, 0.22, 0.22))
     area, cover, _, up = canvas.local(0.3, 2.7, 0.02, 2.4)

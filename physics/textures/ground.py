@@ -9,12 +9,12 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.bonds import Bond, basket, courses, herringbone, random_courses
+from physics.textures.bonds import basket, courses, herringbone, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
-from physics.textures.noise import Noise, blurred, cells, step
+from physics.textures.noise import Field, Noise, blurred, cells, step
 from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
 
-_GREY: Final = ((0.62, 0.61, 0.59), (0.60, 0.59, 0.56), (0.64, 0.63, 0.61))
+_GREY: Final = ((0.57, 0.56, 0.54), (0.55, 0.54, 0.51), (0.59, 0.58, 0.56))
 _RED: Final = ((0.58, 0.36, 0.29), (0.54, 0.33, 0.27), (0.62, 0.40, 0.31), (0.50, 0.31, 0.27))
 _SAND: Final = (0.52, 0.49, 0.44)
 _DARK: Final = (0.36, 0.35, 0.34)
@@ -34,11 +34,10 @@ def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool 
         light = step(0.9, 2.2, chips) - 0.8 * step(0.7, 2.0, -chips)
         rgb = rgb + np.float32(stone) * (light + 0.35 * noise.grain())[..., None]
         if patches:
-            lid = Bond(np.zeros((noise.size,) * 2, np.int32), _patch(noise), 1)
-            inside = step(0.0, 0.008, lid.edge)
-            fresh = plain(noise, (tone - 0.06,) * 3, 0.008, 0.02)
-            seam = 1.0 - step(0.0, 0.012, np.abs(lid.edge))
-            rgb = shaded(mixed(rgb, fresh, inside), 1.0 - 0.30 * seam)
+            edge = _patches(noise)
+            fresh = plain(noise, (tone - 0.035,) * 3, 0.008, 0.02)
+            seam = 1.0 - step(0.0, 0.006, np.abs(edge))
+            rgb = shaded(mixed(rgb, fresh, step(0.0, 0.005, edge)), 1.0 - 0.22 * seam)
         if worn:
             split = cracks(noise, cells(noise, 4), 0.004)
             rgb = shaded(rgb, 1.0 - 0.55 * np.float32(worn) * split)
@@ -48,12 +47,16 @@ def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool 
     return make
 
 
-def _patch(noise: Noise) -> np.ndarray:
-    """Signed distance to a repaired rectangle's outline, positive inside, as a share of the side."""
+def _patches(noise: Noise) -> Field:
+    """Signed distance to the outlines of two repairs and a trench, positive inside, as a share of the side."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size
     x, y = np.meshgrid(at, at)
-    dx, dy = 0.21 - np.abs(x - 0.47), 0.30 - np.abs(y - 0.52)
-    return np.asarray(np.minimum(dx, dy) + 0.004 * noise.clouds(8), dtype=np.float32)
+    repairs = ((0.27, 0.24, 0.12, 0.10), (0.70, 0.66, 0.17, 0.13), (0.50, 0.44, 0.50, 0.035))
+    edges = [
+        np.minimum(half_x - np.abs(x - mx) if half_x < 0.5 else np.float32(1.0), half_y - np.abs(y - my))
+        for mx, my, half_x, half_y in repairs
+    ]
+    return np.asarray(np.max(edges, axis=0) + 0.003 * noise.clouds(8), dtype=np.float32)
 
 
 def _stones(side_m: float, bond: Sequence[object], colours: Sequence[Colour], joint: Colour, **look: float) -> Recipe:
@@ -92,15 +95,16 @@ def _granite(noise: Noise) -> Picture:
 
 def _grass(dry: float, worn: float = 0.0) -> Generator:
     def make(noise: Noise) -> Picture:
-        blades = blurred(noise.grain(), 0.5) * 0.7 + noise.streaks(128, 8) * 0.6 + noise.streaks(128, 4, 1) * 0.5
+        # Blades lean every way: streaks bent by noise, so that no direction shows.
+        one, two = noise.warped(noise.streaks(256, 8), 0.03, 8), noise.warped(noise.streaks(256, 8, 1), 0.03, 8)
+        blades = 0.7 * np.maximum(one, two) + 0.45 * noise.grain(0.7) - 0.4
         tuft = noise.clouds(16)
-        green = mixed((0.25, 0.35, 0.15), (0.38, 0.46, 0.21), step(-1.5, 1.6, blades + 0.6 * tuft))
-        straw = (0.52, 0.48, 0.29)
-        rgb = mixed(green, straw, np.float32(dry) * step(-0.5, 2.2, noise.clouds(8) + 0.5 * blades))
+        green = mixed((0.25, 0.31, 0.16), (0.40, 0.45, 0.25), step(-1.6, 1.8, blades + 0.5 * tuft))
+        rgb = mixed(green, (0.52, 0.48, 0.32), np.float32(dry) * step(-0.3, 2.6, noise.clouds(8) + 0.7 * blades))
         if worn:
-            bare = np.float32(worn) * step(0.5, 1.6, noise.clouds(4) + 0.25 * blades)
-            rgb = mixed(rgb, plain(noise, (0.42, 0.35, 0.27), 0.02, 0.04), bare)
-        return Picture(shaded(rgb, 1.0 + 0.06 * noise.clouds(4) + 0.05 * blades))
+            bare = np.float32(worn) * step(0.3, 2.0, noise.clouds(8) + 0.35 * blades)
+            rgb = mixed(rgb, plain(noise, (0.43, 0.37, 0.29), 0.02, 0.04), bare)
+        return Picture(shaded(rgb, 1.0 + 0.04 * noise.clouds(8) + 0.06 * blades))
 
     return make
 
@@ -147,8 +151,9 @@ def _paint(worn: float) -> Generator:
     def make(noise: Noise) -> Picture:
         below = _asphalt(0.05)(noise).rgb
         paint = plain(noise, (0.86, 0.86, 0.84), 0.015, 0.018)
-        lost = step(1.9 - 1.3 * worn, 3.0 - 1.2 * worn, noise.clouds(8) + 0.6 * noise.grain(0.6))
-        lost = np.maximum(lost, worn * cracks(noise, cells(noise, 6), 0.004))
+        chips = 0.7 * noise.clouds(8) + 0.6 * noise.clouds(64) + 0.7 * noise.grain(0.6)
+        lost = step(2.2 - 1.3 * worn, 2.9 - 1.2 * worn, chips)
+        lost = np.maximum(lost, worn * cracks(noise, cells(noise, 6), 0.003))
         return Picture(mixed(paint, below, 0.9 * lost), 1.0 - 0.9 * lost)
 
     return make
@@ -166,7 +171,7 @@ def _cast(noise: Noise) -> Picture:
 GROUND: Final[Mapping[str, Recipe]] = {
     "asphalt": Recipe(3.0, _asphalt(0.050)),
     "asphalt-worn": Recipe(4.0, _asphalt(0.055, 0.37, worn=1.0)),
-    "asphalt-patched": Recipe(4.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
+    "asphalt-patched": Recipe(6.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
     "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
     "concrete-cast": Recipe(3.0, _cast),
     "slabs-square": _stones(2.0, (courses, 5, [0.4], [0.0]), _GREY, _DARK, joint_m=0.007, spread=0.035),
@@ -175,7 +180,7 @@ GROUND: Final[Mapping[str, Recipe]] = {
         2.4, (courses, 6, [0.6, 0.4, 0.2], [0.0, 0.39, 0.81]), _GREY, _DARK, joint_m=0.007, spread=0.045
     ),
     "slabs-worn": _stones(
-        2.0, (courses, 4, [0.5], [0.0]), (*_GREY, (0.54, 0.53, 0.50)), _SAND, joint_m=0.010, spread=0.06, clouds=0.05
+        2.0, (courses, 4, [0.5], [0.0]), (*_GREY, (0.54, 0.53, 0.50)), _SAND, joint_m=0.010, spread=0.045, clouds=0.03
     ),
     "pavers-running": _stones(1.6, (courses, 16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05),
     "pavers-herringbone": _stones(1.6, (herringbone, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -82,12 +83,12 @@ def stacked(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
     finish = None
     for k, (name, recipe) in enumerate(recipes.items()):
         picture = recipe.make(Noise(size_px, (seed, *name.encode())))
-        rgba[k, ..., :3] = np.clip(picture.rgb, 0.0, 1.0) * 255.0 + 0.5
-        rgba[k, ..., 3] = 255 if picture.alpha is None else np.clip(picture.alpha, 0.0, 1.0) * 255.0 + 0.5
+        rgba[k, ..., :3] = quantised(picture.rgb)
+        rgba[k, ..., 3] = 255 if picture.alpha is None else quantised(picture.alpha)
         mean[k] = mean_linear(rgba[k, ..., :3])
         if picture.finish is not None:
             finish = np.zeros((len(recipes), size_px, size_px, 2), np.uint8) if finish is None else finish
-            finish[k] = np.clip(picture.finish, 0.0, 1.0) * 255.0 + 0.5
+            finish[k] = quantised(picture.finish)
     metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
     for array in (rgba, metres, mean, finish):
         if array is not None:
@@ -120,7 +121,12 @@ LINEAR: Final = linear(np.arange(256) / 255.0)
 """(256,) decoded values of sRGB bytes."""
 
 
+def quantised(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
+    """Values 0 to 1 as bytes, rounded; what lies outside is cut off."""
+    return np.asarray(cv2.convertScaleAbs(np.maximum(values, 0.0), alpha=255.0), dtype=np.uint8)
+
+
 def mean_linear(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(3,) linear mean of an sRGB picture (..., 3)."""
-    counts = [np.bincount(rgb[..., c].ravel(), minlength=256) for c in range(3)]
+    counts = [cv2.calcHist([np.ascontiguousarray(rgb)], [c], None, [256], [0, 256]).ravel() for c in range(3)]
     return np.array([LINEAR @ count / count.sum() for count in counts], dtype=np.float32)

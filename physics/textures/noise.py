@@ -68,7 +68,7 @@ def cells(noise: Noise, across: int, jitter: float = 0.8) -> Cells:
     at[:, 0] += 0.5 * (at[:, 1] % 2) * (across % 2 == 0)
     at += 0.5 + jitter * noise.rng.uniform(-0.5, 0.5, at.shape)
     pixel = np.floor(at / across * size).astype(int) % size
-    margin = min(size // 2, 3 * size // across + 2)
+    margin = min(size // 2, 3 * size // (2 * across) + 2)
     grown = size + 2 * margin
     seeds = np.full((size, size), 255, np.uint8)
     number = np.zeros((size, size), np.int32)
@@ -116,9 +116,16 @@ def _clouds(size: int, cells: int) -> Field:
     total = np.zeros((size, size), np.float32)
     share, n = 1.0, cells
     while n <= size // 2:
-        total += np.float32(share) * _resized(rng.standard_normal((n, n)).astype(np.float32), size)
+        total += np.float32(share) * _resized(_grid(rng, n), size)
         share, n = 0.55 * share, 2 * n
+    # Bent a little by other noise, so that the grid it was drawn on does not show.
+    bend = [np.float32(0.22 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
+    total = remapped(total, bend[0], bend[1])
     return _locked((total - total.mean()) / total.std())
+
+
+def _grid(rng: np.random.Generator, cells: int) -> Field:
+    return rng.standard_normal((cells, cells)).astype(np.float32)
 
 
 @lru_cache(maxsize=16)

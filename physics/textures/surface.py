@@ -15,7 +15,7 @@ def plain(noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.0
     """One colour with large soft patches and fine grain, both given as deviations of sRGB."""
     tone = np.float32(clouds) * noise.clouds(cells) + np.float32(grain) * noise.grain()
     return np.asarray(
-        np.asarray(colour, dtype=np.float32) * (1.0 + tone[..., None] / max(np.mean(colour), 0.1)), dtype=np.float32
+        np.asarray(colour, dtype=np.float32) * (1.0 + tone[..., None] / max(sum(colour) / 3.0, 0.1)), dtype=np.float32
     )
 
 
@@ -79,9 +79,15 @@ def cracks(noise: Noise, found: Cells, width: float, wiggle: float = 0.012) -> F
 
 
 def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 4) -> Rgb:
-    """Darker where water and dirt have been."""
-    dirt = step(0.4, 2.0, noise.clouds(cells))
+    """Darker where dirt has settled, in soft patches."""
+    dirt = step(-0.4, 2.4, noise.clouds(cells))
     return np.asarray(rgb * (1.0 - np.float32(depth) * dirt[..., None]), dtype=np.float32)
+
+
+def weathered(rgb: Rgb, noise: Noise, depth: float) -> Rgb:
+    """Darker where water has run down a wall."""
+    runs = step(-0.6, 3.2, noise.streaks(64, 16) + 0.6 * noise.clouds(8))
+    return np.asarray(rgb * (1.0 - np.float32(depth) * runs[..., None]), dtype=np.float32)
 
 
 def shaded(rgb: Rgb, factor: Field) -> Rgb:

@@ -11,7 +11,7 @@ import numpy as np
 from physics.textures.bonds import courses, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
-from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
+from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained, weathered
 
 _COURSE_M: Final = 0.075
 """A brick of 65 mm and its joint."""
@@ -38,13 +38,12 @@ def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:
         rgb = plain(noise, (0.80, 0.78, 0.74), 0.012 + 0.02 * dirt, 0.006 + 0.010 * rough)
         rgb = shaded(rgb, relief(bumps, 0.03 * rough))
         if dirt:
-            runs = step(0.3, 2.4, noise.streaks(64, 16) + 0.8 * noise.clouds(4))
-            rgb = stained(shaded(rgb, 1.0 - 0.10 * np.float32(dirt) * runs), noise, 0.10 * dirt)
+            rgb = stained(weathered(rgb, noise, 0.14 * dirt), noise, 0.06 * dirt)
         if crazed:
             rgb = shaded(rgb, 1.0 - 0.4 * np.float32(crazed) * cracks(noise, cells(noise, 4), 0.003))
-            bare = step(1.9, 2.1, noise.clouds(4) + 0.12 * noise.grain(1.2))
-            rgb = mixed(rgb, plain(noise, (0.62, 0.57, 0.50), 0.02, 0.03), 0.8 * bare)
-            return Picture(rgb, 1.0 - 0.8 * bare)
+            bare = step(2.2, 2.4, noise.clouds(8) + 0.12 * noise.grain(1.2))
+            rgb = mixed(rgb, plain(noise, (0.66, 0.62, 0.56), 0.02, 0.03), 0.7 * bare)
+            return Picture(rgb, 1.0 - 0.7 * bare)
         return Picture(rgb)
 
     return make
@@ -66,7 +65,7 @@ def _brick(
                 max(b.n for b in bonds),
             )
         whole = laid(noise, bond, 2.7, colours, joint, joint_m=0.010, spread=0.07, grain=0.03, joint_tint=0.2)
-        return Picture(stained(whole.rgb, noise, 0.10), whole.alpha)
+        return Picture(weathered(whole.rgb, noise, 0.08), whole.alpha)
 
     return Recipe(2.7, make)
 
@@ -81,9 +80,8 @@ def _panels(noise: Noise) -> Picture:
     x, y = np.meshgrid(at, at)
     hole = 1.0 - step(0.012, 0.022, np.hypot((x % 1.5) - 0.75, np.abs((y % 1.5) - 0.75) - 0.4))
     pores = step(2.0, 2.8, noise.grain(0.5))
-    runs = step(0.6, 2.6, noise.streaks(64, 32))
-    rgb = shaded(whole.rgb, (1.0 - 0.45 * hole) * (1.0 - 0.12 * pores) * (1.0 - 0.08 * runs))
-    return Picture(stained(rgb, noise, 0.08), whole.alpha)
+    rgb = shaded(whole.rgb, (1.0 - 0.45 * hole) * (1.0 - 0.12 * pores))
+    return Picture(weathered(rgb, noise, 0.10), whole.alpha)
 
 
 def _boarded(noise: Noise) -> Picture:
@@ -98,7 +96,7 @@ def _boarded(noise: Noise) -> Picture:
         [0.0, 0.35, 0.7],
     )
     rgb = laid(noise, bond, 2.4, ((0.64, 0.63, 0.61),), (0.50, 0.49, 0.47), joint_m=0.004, spread=0.03).rgb
-    return Picture(stained(shaded(rgb, 1.0 + 0.025 * noise.streaks(64, 8, 1)), noise, 0.12))
+    return Picture(weathered(shaded(rgb, 1.0 + 0.025 * noise.streaks(64, 8, 1)), noise, 0.05))
 
 
 def _ashlar(noise: Noise) -> Picture:
@@ -124,7 +122,7 @@ def _rubble(noise: Noise) -> Picture:
 
 
 def _aged(picture: Picture, noise: Noise) -> Picture:
-    return Picture(stained(picture.rgb, noise, 0.12), picture.alpha)
+    return Picture(weathered(picture.rgb, noise, 0.10), picture.alpha)
 
 
 def _boards(side_m: float, board_m: float, upright: bool, colour: Colour = (0.62, 0.54, 0.43)) -> Recipe:
@@ -191,7 +189,7 @@ def _roof_tiles(noise: Noise) -> Picture:
     hump = 0.82 + 0.22 * np.sin(np.pi * (across % 1.0)) + 0.06 * np.cos(2.0 * np.pi * (across % 1.0 - 0.2))
     lip = 1.0 - 0.42 * np.exp(-(down % 1.0) / 0.07) + 0.06 * (down % 1.0)
     shape = (hump[None, :] * lip[:, None]).astype(np.float32)
-    rgb = shaded(plain(noise, (0.58, 0.34, 0.25), 0.03, 0.025), shape * tone)
+    rgb = shaded(plain(noise, (0.55, 0.35, 0.28), 0.02, 0.025, 8), shape * tone)
     moss = step(1.0, 2.6, noise.clouds(8) + 0.4 * noise.grain(1.2))
     return Picture(mixed(rgb, shaded(plain(noise, (0.36, 0.35, 0.24), 0.02, 0.03), shape), 0.6 * moss))
 
@@ -216,8 +214,8 @@ def _seamed(noise: Noise) -> Picture:
     """Sheet metal roof with a standing seam every 0.5 m."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 4.0 % 1.0
     seam = 1.0 + 0.18 * np.exp(-(((at - 0.48) / 0.012) ** 2)) - 0.30 * np.exp(-(((at - 0.52) / 0.015) ** 2))
-    rgb = plain(noise, (0.48, 0.51, 0.52), 0.02, 0.008)
-    return Picture(shaded(stained(rgb, noise, 0.10), np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32)))
+    rgb = plain(noise, (0.48, 0.51, 0.52), 0.012, 0.008)
+    return Picture(shaded(weathered(rgb, noise, 0.08), np.broadcast_to(seam, (noise.size,) * 2).astype(np.float32)))
 
 
 def _felt(noise: Noise) -> Picture:
@@ -264,7 +262,7 @@ def _brushed(noise: Noise) -> Picture:
 
 def _painted(noise: Noise) -> Picture:
     rgb = plain(noise, (0.70, 0.70, 0.70), 0.010, 0.008)
-    rust = step(2.4, 2.9, noise.clouds(8) + 0.3 * noise.grain(1.2))
+    rust = step(2.5, 3.0, 0.6 * noise.clouds(16) + 0.8 * noise.grain(1.2))
     return Picture(mixed(rgb, (0.40, 0.26, 0.18), 0.7 * rust), 1.0 - 0.7 * rust)
 
 
