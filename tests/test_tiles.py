@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import shapely
 
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from physics.buildings import Frontage
+from physics.paint import paint_in
 from physics.tiles import CURB_M, TILE_M, Tile, build_tile, distance_to, key_at, keys_within, square
 
 
@@ -159,3 +162,21 @@ def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
     assert forward != {key: other.in_tile(key) for key in KEYS}
     ids = [b.id for buildings in forward.values() for b in buildings]
     assert len(ids) == len(set(ids))
+
+
+def test_paint_lies_on_its_ground() -> None:
+    """Lines are on roads and domes on walkable ground, millimetres above it, each in the tile of its middle."""
+    crossing = dataclasses.replace(MAP.strips[":c0"], signalised=True, crosses=("e", "-e"))
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": crossing}, _trees={})
+    found: dict[str, int] = {}
+    for key in keys_within(0.0, 0.0, 60.0):
+        tile = build_tile(street_map, key)
+        for name, mesh in paint_in(street_map, tile).items():
+            middles = mesh.vertices[mesh.triangles].mean(axis=1)
+            kinds = ("strip", "corner") if name.startswith("tactile") else ("lane", "junction", "strip")
+            for x, y in middles[:, :2].tolist():
+                assert any(street_map.near(kind, shapely.Point(x, y)) for kind in kinds), (name, x, y)
+            above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
+            assert above.min() > 0.003 and above.max() < 0.005
+            found[name] = found.get(name, 0) + len(mesh)
+    assert found["tactile-domes"] >= 4 and found["paint"] >= 20

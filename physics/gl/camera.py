@@ -106,16 +106,25 @@ class GlCamera:
                 self._shadows.draw(middle, anchor, self._light, self._scene.draw)
                 self._shadows.bind()
             self._block.write(camera_matrix(taken, anchor), _TO_TEXTURE @ from_sun, taken, anchor, self._light)
-            target.frame.use()
+            target.use()
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"  # the picture is drawn upside down, to be read top first
             gl.depth_func = "<"
             target.frame.clear(depth=1.0)
             self._scene.draw("colour")
+            self._draw_paint(gl, target)
             gl.depth_func = "<="
             self._backdrop.draw()
             rgb, labels = target.read()
             return Frame(rgb, labels, target.read_depth() if self._depth else None)
+
+    def _draw_paint(self, gl: moderngl.Context, target: Target) -> None:
+        """Paint changes colours alone: the ground keeps its labels and its depth."""
+        gl.polygon_offset = -1.0, -8.0
+        target.use(labels=False, depth=False)
+        self._scene.draw_paint()
+        target.use()
+        gl.polygon_offset = 0.0, 0.0
 
     def _target(self, size: tuple[int, int]) -> Target:
         if size not in self._targets:

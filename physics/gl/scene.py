@@ -24,12 +24,12 @@ from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
 from physics.gl.shadows import REACH_M, STEP_M, middle_of
 from physics.gl.surfaces import surfaces
-from physics.gl.tiles import TileBuffers, TileShaders
+from physics.gl.tiles import TileBuffers, TileShaders, ground_parts, paint_parts
 from physics.gl.walls import WallBuffers, WallShaders
 from physics.ground import Ground
 from physics.mesh import Mesh
 from physics.robots import RobotModel
-from physics.tiles import Key, distance_to, keys_within
+from physics.tiles import Key, distance_to, keys_within, square
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
 
 _TILE_REACH_M: Final = 34.0
@@ -42,10 +42,12 @@ _NOTHING: Final[Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTAN
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """A tile on the graphics card, and the things that stand in it, at (N, 2) thing_xy, drawn as far as (N,) seen_m.
-    Their rows are relative to the tile's middle."""
+    """A tile on the graphics card, its (2,) middle in world metres, and the things that stand in it, at (N, 2)
+    thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
 
-    buffers: TileBuffers
+    middle: Floats
+    ground: TileBuffers
+    paint: TileBuffers | None
     walls: WallBuffers
     things: Placed
     thing_xy: Floats
@@ -54,7 +56,9 @@ class _Tile:
     post_z: Floats
 
     def release(self) -> None:
-        self.buffers.release()
+        self.ground.release()
+        if self.paint is not None:
+            self.paint.release()
         self.walls.release()
 
 
@@ -127,7 +131,13 @@ class Scene:
         if stage != "moving":
             for tile in self._in_view if stage == "colour" else self._shading:
                 tile.walls.draw(stage, self._anchor)
-                tile.buffers.draw(stage, self._anchor)
+                tile.ground.draw(stage, self._anchor)
+
+    def draw_paint(self) -> None:
+        """Draw what lies on the ground; to be drawn after it, without labels and depth."""
+        for tile in self._in_view:
+            if tile.paint is not None:
+                tile.paint.draw("colour", self._anchor)
 
     def release(self) -> None:
         for tile in self._tiles.values():
@@ -146,12 +156,16 @@ class Scene:
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
         self._around = [self._tiles[key] for key in keys]
-        middles = np.array([tile.buffers.middle for tile in self._around])
+        middles = np.array([tile.middle for tile in self._around])
         self._in_view = [self._around[i] for i in _in_wedge(view, middles, _TILE_REACH_M)]
 
     def _built(self, key: Key) -> _Tile:
-        buffers = TileBuffers(self._context, self._shaders, self._ground.tile(key), self._ground.seed)
-        middle = buffers.middle
+        x0, y0, x1, y1 = square(key)
+        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+        tile = self._ground.tile(key)
+        ground = TileBuffers(self._context, self._shaders, ground_parts(tile, self._ground.seed), middle)
+        lines = paint_parts(self._ground.street_map, tile)
+        painted = TileBuffers(self._context, self._shaders, lines, middle) if lines else None
         walls = WallBuffers(self._context, self._wall_shaders, self._ground.buildings(key), middle)
         posts = props.posts_in(self._ground.street_map, key)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
@@ -167,7 +181,7 @@ class Scene:
         things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
         seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
-        return _Tile(buffers, walls, things, thing_xy, seen_m, posts, post_z)
+        return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
 
     def _prop_form(self, kind: str, variant: int) -> int:
         return self._forms.id(
@@ -186,7 +200,7 @@ class Scene:
     def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> Placed:
         form, things = tile.things
         here = things[rows]
-        here["at"][:, :2] += tile.buffers.middle - self._anchor
+        here["at"][:, :2] += tile.middle - self._anchor
         return form[rows], here
 
     def _fence(self, barrier: Barrier) -> Placed:

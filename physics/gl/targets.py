@@ -21,6 +21,11 @@ class Target:
         self._depth = context.depth_renderbuffer(size)
         self.frame = context.framebuffer([self._colour], self._depth)
 
+    def use(self, labels: bool = True, depth: bool = True) -> None:
+        """Draw into it from now on; what is False keeps what it holds."""
+        self.frame.color_mask, self.frame.depth_mask = (True, True, True, labels), depth
+        self.frame.use()
+
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Colours (H, W, 3) and labels (H, W), the top row first."""
         width, height = self.size

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Final, NamedTuple
 
 import moderngl
-import numpy as np
 
 from cosim.geometry import Floats
 from cosim.state import LABELS
+from cosim.streetmap import StreetMap
 from physics.gl.corners import LAYOUT, corners, joined
 from physics.gl.shading import Programs, Stage, programs, put
 from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.materials import PAVINGS
+from physics.mesh import Mesh
+from physics.paint import paint_in
 from physics.textures.ground import layer_of
-from physics.tiles import Tile, square, surface
+from physics.tiles import Tile, surface
 
 _TINTED: Final = 128
 """Added to the label of a surface whose colour tints its texture."""
@@ -64,18 +67,41 @@ class TileShaders:
                 program["layers"].write(surfaces.known)  # type: ignore[union-attr]
 
 
-class TileBuffers:
-    """The ground of one tile. middle: (2,) world metres."""
+class GroundPart(NamedTuple):
+    """A mesh of one material. layer: its texture; tint: its colour, None for the texture's own."""
 
-    def __init__(self, context: moderngl.Context, shaders: TileShaders, tile: Tile, seed: int) -> None:
-        x0, y0, x1, y1 = square(tile.key)
-        self.middle: Floats = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+    mesh: Mesh
+    layer: str
+    label: str
+    tint: tuple[float, float, float] | None = None
+
+
+def ground_parts(tile: Tile, seed: int) -> list[GroundPart]:
+    """The ground of a tile, a part for each of its surfaces."""
+    found = []
+    for name, mesh in tile.parts.items():
+        label, colour = surface(name)
+        found.append(GroundPart(mesh, layer_of(name, seed), label, colour if name in PAVINGS else None))
+    return found
+
+
+def paint_parts(street_map: StreetMap, tile: Tile) -> list[GroundPart]:
+    """What lies on the ground of a tile; drawn without labels."""
+    return [GroundPart(mesh, layer, "road") for layer, mesh in paint_in(street_map, tile).items()]
+
+
+class TileBuffers:
+    """Parts of the ground of one tile. middle: (2,) world metres of the tile's."""
+
+    def __init__(
+        self, context: moderngl.Context, shaders: TileShaders, ground: Sequence[GroundPart], middle: Floats
+    ) -> None:
+        self._middle = middle
         parts = []
-        for name, mesh in tile.parts.items():
-            label, colour = surface(name)
-            here = mesh.moved((*-self.middle, 0.0))
-            rows = corners(here, colour, LABELS[label] + (_TINTED if name in PAVINGS else 0))
-            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer_of(name, seed))
+        for mesh, layer, label, tint in ground:
+            here = mesh.moved((*-middle, 0.0))
+            rows = corners(here, tint or (0.0, 0.0, 0.0), LABELS[label] + (_TINTED if tint else 0))
+            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
             parts.append((here, rows))
         rows, triangles = joined(parts)
         self._programs = shaders.programs
@@ -88,8 +114,8 @@ class TileBuffers:
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if stage != "moving":
             program = self._programs.of(stage)
-            put(program, "middle", tuple(self.middle - anchor))
-            put(program, "middle_in_world", tuple(self.middle))
+            put(program, "middle", tuple(self._middle - anchor))
+            put(program, "middle_in_world", tuple(self._middle))
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
