@@ -6,6 +6,8 @@ started again in the middle of an episode without a trace in the result.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import msgspec
@@ -15,13 +17,22 @@ from cosim.state import Doing
 
 Kind = Literal["obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"]
 
+GROUPS: Mapping[Kind, tuple[int, int]] = MappingProxyType(
+    {
+        "obstructing": (1, 1), "conversing": (2, 4), "queueing": (2, 5), "frontal": (1, 1), "lateral": (1, 1),
+        "overtaking": (1, 1), "ped_crossing": (1, 4), "gesturing": (1, 1),
+    }
+)  # fmt: skip
+"""How many people each kind of event may have."""
+
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):
-    """One event pedestrian (or group) on the way.
+    """One event: a pedestrian or a group on the way.
 
-    x_m, y_m, heading_rad: the place on the middle of the sidewalk where it happens, heading along the robot's
-    direction of travel. half_width_m: from there to either edge of the sidewalk. route_s_m: the same place as
-    arc length of the reference route. speed_mps: walking speed. hold_s: how long a standing one stays.
+    x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
+    the robot's direction of travel. half_width_m: from there to either edge. half_length_m: of a crosswalk, from there
+    to either end along the heading. route_s_m: the same place as arc length of the reference route. people: how many.
+    speed_mps: walking speed. hold_s: how long those stay who stand. side: of the sidewalk, left (1) or right (-1).
     """
 
     id: str
@@ -34,6 +45,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     speed_mps: float = 1.3
     hold_s: float = 20.0
     side: Literal[-1, 1] = 1
+    people: int = 1
+    half_length_m: float = 0.0
 
     def __post_init__(self) -> None:
         if not self.id.startswith("e"):
@@ -42,27 +55,43 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"event '{self.id}': speed_mps must be in (0, 3], not {self.speed_mps}")
         if not self.half_width_m > 0.3:
             raise SpecError(f"event '{self.id}': half_width_m must exceed a person's 0.3 m, not {self.half_width_m}")
+        fewest, most = GROUPS[self.kind]
+        if not fewest <= self.people <= most:
+            allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            raise SpecError(f"event '{self.id}': people of '{self.kind}' must be {allowed}, not {self.people}")
+        if (self.kind == "ped_crossing") != (self.half_length_m > 0.0):
+            raise SpecError(f"event '{self.id}': half_length_m is the crosswalk's: of 'ped_crossing', and of no other")
+
+
+class Walker(msgspec.Struct, frozen=True, kw_only=True):
+    """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
+
+    blocked_ticks: how long it has stood against the robot.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    aim_rad: float | None = None
+    pace_mps: float | None = None
+    blocked_ticks: int = 0
 
 
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
     """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good. since_tick: in this phase.
 
-    aim_rad: the heading an actor has committed to, if it has. blocked_ticks: how long it has stood against the robot.
+    trigger_distance_m: along the route from the robot to the event's place when it triggered, negative behind it.
     """
 
     phase: Literal["waiting", "acting", "over", "gone"]
     since_tick: int
-    x_m: float
-    y_m: float
-    heading_rad: float
+    walkers: tuple[Walker, ...]
     triggered_tick: int | None = None
     trigger_distance_m: float | None = None
-    aim_rad: float | None = None
-    blocked_ticks: int = 0
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
-    """An event pedestrian as the world shows it at one tick."""
+    """An event pedestrian as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones."""
 
     id: str
     x_m: float

@@ -1,0 +1,91 @@
+"""How event pedestrians move: places beside an event, turning at a human rate, steps round the robot or against it."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+
+from cosim.events import Event, EventQuery, Walker
+from cosim.geometry import Pose, wrap_angle
+from cosim.giveway import Body, stepped_round, touches
+from cosim.state import PERSON_RADIUS_M
+
+EDGE_GAP_M = 0.1
+TURN_RADPS = math.pi
+GIVES_UP_S = 2.0
+"""How long somebody stands against a robot that it has run into before it goes round."""
+
+
+def placed(event: Event, along_m: float, left_m: float, facing_rad: float) -> Walker:
+    """Somebody at a place of the event's frame: metres along its heading and to the left, facing in that frame."""
+    x_m, y_m = spot(event, along_m, left_m)
+    return Walker(x_m=x_m, y_m=y_m, heading_rad=wrap_angle(event.heading_rad + facing_rad))
+
+
+def spot(event: Event, along_m: float, left_m: float) -> tuple[float, float]:
+    """World metres of a place in the event's frame."""
+    cos, sin = math.cos(event.heading_rad), math.sin(event.heading_rad)
+    return event.x_m + cos * along_m - sin * left_m, event.y_m + sin * along_m + cos * left_m
+
+
+def edge_m(event: Event) -> float:
+    """How far from the middle one can stand with both shoulders on the sidewalk."""
+    return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
+
+
+def robot_of(query: EventQuery) -> Body:
+    """The robot as people see it."""
+    pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
+    return Body(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
+
+
+def turned(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
+    """Heading after one tick of turning at a human rate."""
+    error = wrap_angle(wanted_rad - heading_rad)
+    return wrap_angle(heading_rad + max(-TURN_RADPS * tick_s, min(TURN_RADPS * tick_s, error)))
+
+
+def walked_to(walker: Walker, x_m: float, y_m: float, speed_mps: float, query: EventQuery) -> Walker:
+    """One tick towards a point, facing it, round the robot if that is in the way; exactly there when in reach."""
+    tick_s = query.tick_ms / 1000
+    dx, dy = x_m - walker.x_m, y_m - walker.y_m
+    far_m = math.hypot(dx, dy)
+    share = min(speed_mps * tick_s / max(far_m, 1e-9), 1.0)
+    wanted = (x_m, y_m) if share == 1.0 else (walker.x_m + share * dx, walker.y_m + share * dy)
+    heading = walker.heading_rad if share == 1.0 else turned(walker.heading_rad, math.atan2(dy, dx), tick_s)
+    return stepped(walker, wanted, heading, query)
+
+
+def walked_on(walker: Walker, heading_rad: float, speed_mps: float, query: EventQuery) -> Walker:
+    """One tick in a direction, round the robot if that is in the way."""
+    tick_s = query.tick_ms / 1000
+    step_m = speed_mps * tick_s
+    onward = (walker.x_m + math.cos(heading_rad) * step_m, walker.y_m + math.sin(heading_rad) * step_m)
+    return stepped(walker, onward, turned(walker.heading_rad, heading_rad, tick_s), query)
+
+
+def stepped(walker: Walker, wanted: tuple[float, float], heading_rad: float, query: EventQuery) -> Walker:
+    """The walker one step on, with the step led round the robot."""
+    before, after = np.array([[walker.x_m, walker.y_m]]), np.array([wanted])
+    x_m, y_m = stepped_round(before, after, robot_of(query))[0].tolist()
+    return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
+
+
+def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, query: EventQuery) -> Walker:
+    """One tick straight on whether or not the robot is there; one that meets the robot stands and does not push it."""
+    if touches(np.array([walker.x_m, walker.y_m]), robot_of(query)):
+        return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1)
+    step_m = speed_mps * query.tick_ms / 1000
+    return msgspec.structs.replace(
+        walker,
+        x_m=walker.x_m + math.cos(heading_rad) * step_m,
+        y_m=walker.y_m + math.sin(heading_rad) * step_m,
+        heading_rad=wrap_angle(heading_rad),
+    )
+
+
+def gave_up(walker: Walker, query: EventQuery) -> bool:
+    """Whether somebody has stood against the robot long enough."""
+    return walker.blocked_ticks * query.tick_ms / 1000 >= GIVES_UP_S
