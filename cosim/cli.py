@@ -310,9 +310,11 @@ def print_table(table: pd.DataFrame, scheduled: int) -> None:
             means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
         out.print(means)
     crashed = table[table["status"] == "crashed"]
-    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}")
-    for _, row in crashed.iterrows():
-        out.print(f"crashed {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+    invalid = table[table["status"] == "invalid"]
+    counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
+    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
+    for _, row in pd.concat([crashed, invalid]).iterrows():
+        out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
 
 
 def print_episode(record: object) -> None:

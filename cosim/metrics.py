@@ -8,11 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from cosim.record import Log
+from cosim.record import Ended, Log
 from cosim.referee import Failure
 
 SCHEMA = 1
@@ -29,13 +29,15 @@ RATE_NEEDS_M = 1.0
 
 @dataclass(frozen=True)
 class Episode:
-    """What the metrics see of an episode. route_length_m: of the reference route, the geodesic walkable length."""
+    """What the metrics see of an episode. route_length_m: of the reference route, the geodesic walkable length.
+    rules_broken: of events that were not passed as they should be."""
 
     log: Log
     failures: tuple[Failure, ...]
     red_light_entries: int
-    ended: Literal["goal", "timeout", "failure"] | None
+    ended: Ended | None
     route_length_m: float
+    rules_broken: int = 0
 
 
 class Metric(NamedTuple):
@@ -52,8 +54,8 @@ def goal_reached(episode: Episode) -> float:
 
 
 def success(episode: Episode) -> float:
-    """1 if the goal was reached within the time limit without any failure."""
-    return float(episode.ended == "goal" and not episode.failures)
+    """1 if the goal was reached, or the stop made that was asked for, in time, without a failure or a broken rule."""
+    return float(episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken)
 
 
 def travelled_m(episode: Episode) -> float:
@@ -78,8 +80,8 @@ def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
 
 
 def route_completion(episode: Episode) -> float:
-    """Progress / route length, in [0, 1]; 1 needs the goal."""
-    if episode.ended == "goal" and not np.isfinite(episode.log.reset_s_m).any():
+    """Progress / route length, in [0, 1]; 1 needs the goal, or the stop where that is asked for."""
+    if episode.ended in ("goal", "stop") and not np.isfinite(episode.log.reset_s_m).any():
         return 1.0
     return min(progress_m(episode) / episode.route_length_m, 1.0)
 
@@ -166,6 +168,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "failures_per_100m_progress": Metric("1/100 m", False, per_100m("", progress_m)),
         "velocity_mean_mps": Metric("m/s", True, velocity_mean_mps),
         "failures": Metric("", False, count("")),
+        "rules_broken": Metric("", False, lambda episode: float(episode.rules_broken)),
         "collisions": Metric("", False, count("collision")),
         "out_of_lane": Metric("", False, count("out_of_lane")),
         "freezings": Metric("", False, count("freezing")),

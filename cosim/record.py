@@ -29,7 +29,8 @@ SCHEMA = 1
 NO_RENDERER = "none"
 """The renderer of an episode whose policy has no camera."""
 
-Status = Literal["done", "crashed"]
+Status = Literal["done", "crashed", "invalid"]
+Ended = Literal["goal", "stop", "timeout", "failure"]
 
 
 @dataclass(frozen=True)
@@ -40,6 +41,7 @@ class Log:
     travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
     reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
     people_tick (P,), people_xy (P, 2), people_event (P,) bool: persons within 30 m, once a second, for pictures.
+    event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
     """
 
     tick_s: float
@@ -54,6 +56,7 @@ class Log:
     people_tick: NDArray[np.int64]
     people_xy: Floats
     people_event: NDArray[np.bool_]
+    event_tracks: Floats
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -81,17 +84,26 @@ class Log:
 
 
 class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
-    """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger never fired."""
+    """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger never fired.
+
+    seen: one of its people was before the robot once (`cosim.witness`). rule_met: whether the robot kept the event's
+    rule; absent where there is none.
+    """
 
     id: str
     kind: str
     passed: bool
     triggered_at_s: float | None = None
     trigger_distance_m: float | None = None
+    seen: bool = False
+    rule_met: bool | None = None
 
 
 class Record(msgspec.Struct, frozen=True, kw_only=True):
-    """What came out of one episode. reason: why it crashed. clock: wall times, not reproducible."""
+    """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
+
+    invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
+    """
 
     scenario: str
     scenario_hash: str
@@ -105,7 +117,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
     status: Status
     reason: str = ""
-    ended: Literal["goal", "timeout", "failure"] | None = None
+    ended: Ended | None = None
     ticks: int = 0
     state_hash: str = ""
     measures: dict[str, float | None] = {}
@@ -204,8 +216,8 @@ class Recorder:
                 x, y = people.xy[i]
                 self._people.append((step.tick, float(x), float(y), people.ids[i].startswith("e")))
 
-    def log(self) -> Log:
-        """The episode so far."""
+    def log(self, event_tracks: Floats) -> Log:
+        """The episode so far. event_tracks: see `Log`."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 12)
         people = np.array(self._people, dtype=float).reshape(-1, 4)
         return Log(
@@ -221,4 +233,5 @@ class Recorder:
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_event=people[:, 3] > 0,
+            event_tracks=event_tracks,
         )

@@ -10,6 +10,8 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   red crossing of the route does not count.
 - Signals are judged on the crossings of the reference route, by arc length.
 - One failure a tick: collision before out_of_lane before freezing.
+- Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2 s ends it well,
+  passing the pedestrian ends it badly.
 - After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing nor
   at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at least 1 m
   beyond them.
@@ -18,6 +20,7 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,6 +29,7 @@ from typing import Literal
 import numpy as np
 
 from cosim.clock import Clock
+from cosim.events import Event, EventState
 from cosim.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.scenario import Scenario
 from cosim.state import PERSON_RADIUS_M, Contact, Signal
@@ -45,6 +49,9 @@ BEYOND_M = 1.0
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
 STANDING_MPS = 0.05
+STOP_S = 2.0
+STOP_WITHIN_M = 3.0
+"""Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
 LEFT_M = 0.3
 """A robot this far before a crossing has left it and may enter it anew."""
 
@@ -73,7 +80,7 @@ class Verdict:
 
     failure: Failure | None = None
     reset: Reset | None = None
-    ended: Literal["goal", "timeout", "failure"] | None = None
+    ended: Literal["goal", "stop", "timeout", "failure"] | None = None
     red_light_entry: str | None = None
     waits_at_red: bool = False
 
@@ -92,6 +99,7 @@ class Referee:
         self._window: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
+        self._stood_ticks = 0
 
     def judge(self, step: Step) -> Verdict:
         """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
@@ -109,11 +117,27 @@ class Referee:
         self._entered.clear()
         return Verdict(failure, reset, None, red, waits)
 
-    def _end(self, step: Step) -> Literal["goal", "timeout"] | None:
+    def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
+        if self._scenario.ends_at == "stop":
+            return self._end_by_stop(step)
         pose, goal = step.motion.robot.pose, self._scenario.goal
         near = np.hypot(pose.x_m - goal[0], pose.y_m - goal[1]) <= self._scenario.goal_radius_m
         if near and step.route_s_after_m >= self._route.length_m - 2 * self._scenario.goal_radius_m:
             return "goal"
+        return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
+        """The episode of a gesturing pedestrian: over when the robot has stopped before it, or has passed it."""
+        robot = step.motion.robot
+        here = any(
+            state.phase == "acting" and stands_before(robot.pose, event, state)
+            for event, state in zip(self._scenario.events, step.events.states, strict=True)
+        )
+        self._stood_ticks = self._stood_ticks + 1 if here and abs(robot.v_mps) < STANDING_MPS else 0
+        if self._stood_ticks >= self._clock.ticks(STOP_S):
+            return "stop"
+        if all(step.route_s_after_m > event.route_s_m for event in self._scenario.events):
+            return "failure"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
 
     def _collision(self, step: Step) -> Failure | None:
@@ -209,6 +233,16 @@ class Referee:
         if len(people) and np.hypot(*(people.xy - pose.xy).T).min() < FREE_OF_PEOPLE_M:
             return False
         return not (len(vehicles) and np.hypot(*(vehicles.xy - pose.xy).T).min() < FREE_OF_VEHICLES_M)
+
+
+def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
+    """Whether the robot is within STOP_WITHIN_M of somebody, on the side from which it came."""
+    for walker in state.walkers:
+        dx, dy = robot.x_m - walker.x_m, robot.y_m - walker.y_m
+        behind = dx * math.cos(event.heading_rad) + dy * math.sin(event.heading_rad) > 0.0
+        if not behind and math.hypot(dx, dy) <= STOP_WITHIN_M:
+            return True
+    return False
 
 
 def signal_is_red(crossing_id: str, signals: Mapping[str, Signal]) -> bool:

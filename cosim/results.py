@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -20,7 +20,7 @@ KEYS: tuple[str, ...] = (
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
 WORST: dict[str, float] = {"success": 0.0, "goal_reached": 0.0, "route_completion": 0.0, "spl": 0.0}
-"""What a crashed episode counts as: it is scheduled, so it stays in these means."""
+"""What a crashed episode counts as: it is scheduled, so it stays in these means. An invalid one has no measures."""
 
 
 def row_of(record: Record) -> dict[str, Any]:
@@ -28,7 +28,8 @@ def row_of(record: Record) -> dict[str, Any]:
     row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
     row["metric_schema"] = metrics.SCHEMA
     row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
-    measures = dict(record.measures) if record.status == "done" else dict(WORST)
+    counted: dict[str, Mapping[str, float | None]] = {"done": record.measures, "crashed": WORST, "invalid": {}}
+    measures = counted[record.status]
     return row | {name: measures.get(name) for name in METRICS}
 
 

@@ -152,6 +152,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     goal_radius_m: float = 1.0
     time_limit_s: float = 300.0
     ends_on_failure: bool = False
+    ends_at: Literal["goal", "stop"] = "goal"
     light: Light = Light()
     schema: int = SCHEMA
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from cosim.record import Status
 from cosim.scenario import Scenario
 
 
@@ -35,7 +36,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     """The episode is over and its record is on disk."""
 
     scenario: str
-    status: Literal["done", "crashed"]
+    status: Status
 
 
 class Unsaved(msgspec.Struct, frozen=True, tag=True):

@@ -11,7 +11,6 @@ from typing import Any
 import msgspec
 
 from cosim.errors import CosimError
-from cosim.events import EventState
 from cosim.loop import steps
 from cosim.metrics import Episode, measure
 from cosim.ports import Policy
@@ -19,11 +18,9 @@ from cosim.record import Log, Record, Recorder, TriggeredEvent, begun
 from cosim.referee import Failure, Referee, Verdict
 from cosim.scenario import Scenario
 from cosim.step import Step
+from cosim.witness import Witness, unwitnessed
 from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
-
-PASSED_M = 5.0
-"""An event lies behind once the robot is this far beyond its place."""
 
 Watch = Callable[[Step, Verdict], None]
 
@@ -65,6 +62,7 @@ def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None)
     """The episode itself, once every engine runs."""
     referee = Referee(scenario, stage.area, stage.parts.world.footprint_m, stage.clock)
     recorder = Recorder(stage.clock.tick_s)
+    witness = Witness(scenario, stage.clock.tick_ms)
     failures: list[Failure] = []
     red_lights: list[str] = []
     run = steps(scenario, stage.clock, stage.parts)
@@ -72,6 +70,7 @@ def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None)
     while True:
         verdict = referee.judge(step)
         recorder.add(step, verdict)
+        witness.see(step)
         if verdict.failure is not None:
             failures.append(verdict.failure)
         if verdict.red_light_entry is not None:
@@ -82,35 +81,34 @@ def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None)
             break
         step = run.send(verdict.reset)
     run.close()
-    log = recorder.log()
-    seen = Episode(log, tuple(failures), len(red_lights), verdict.ended, scenario.route_line.length_m)
+    log = recorder.log(witness.tracks)
+    events = witness.outcomes()
+    broken = sum(event.rule_met is False for event in events)
+    seen = Episode(log, tuple(failures), len(red_lights), verdict.ended, scenario.route_line.length_m, broken)
+    reason = unseen(scenario, events)
     done = replaced(
         record,
-        status="done",
+        status="invalid" if reason else "done",
+        reason=reason,
         ended=verdict.ended,
         ticks=len(log),
         state_hash=recorder.hash.hexdigest(),
         measures=measure(seen),
         failures=tuple(failures),
-        events=events_of(scenario, step.events.states, float(log.route_s_m.max()), stage.clock.tick_ms),
+        events=events,
     )
     return done, log
 
 
-def events_of(
-    scenario: Scenario, states: tuple[EventState, ...], furthest_m: float, tick_ms: int
-) -> tuple[TriggeredEvent, ...]:
-    """What became of the events of an episode."""
-    return tuple(
-        TriggeredEvent(
-            id=event.id,
-            kind=event.kind,
-            passed=furthest_m >= event.route_s_m + PASSED_M,
-            triggered_at_s=None if state.triggered_tick is None else state.triggered_tick * tick_ms / 1000,
-            trigger_distance_m=state.trigger_distance_m,
-        )
-        for event, state in zip(scenario.events, states, strict=True)
-    )
+def unseen(scenario: Scenario, events: tuple[TriggeredEvent, ...]) -> str:
+    """Why an episode that is about its event says nothing about the robot; "" if it does.
+
+    A long way has events that a robot may fail to come to; there this makes nothing invalid.
+    """
+    if not scenario.ends_on_failure:
+        return ""
+    reasons = [unwitnessed(event, outcome) for event, outcome in zip(scenario.events, events, strict=True)]
+    return "; ".join(filter(None, reasons))
 
 
 def replaced(record: Record, **changes: Any) -> Record:

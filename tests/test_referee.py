@@ -10,7 +10,7 @@ import pytest
 from shapely.geometry import box
 
 from cosim.clock import Clock
-from cosim.events import EventReply
+from cosim.events import Event, EventReply, EventState, Walker
 from cosim.geometry import Pose
 from cosim.referee import Referee, Verdict
 from cosim.scenario import City, RouteCrossing, Scenario
@@ -51,12 +51,13 @@ def step(
     speed: float = 1.0,
     red: Sequence[str] = (),
     cars: Vehicles = NO_VEHICLES,
+    events: EventReply = NOTHING,
 ) -> Step:
     """The robot ends the tick at (x, y), which is also its place on the route."""
     robot = RobotState(Pose(x_m, y_m, 0.0), speed)
     street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
     motion = Motion(robot, frozen([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
-    return Step(tick, robot, street, x_m, None, STILL, NOTHING, motion, street, x_m)
+    return Step(tick, robot, street, x_m, None, STILL, events, motion, street, x_m)
 
 
 def judge_all(one: Referee, steps: Sequence[Step]) -> list[Verdict]:
@@ -244,3 +245,42 @@ def test_people_are_seen_from_the_footprint_not_from_the_centre() -> None:
     gaps = person_gaps(step(0, 0.0, who=people((1.35, 0.0), (0.0, 1.275))), (0.35, 0.275))
     assert list(gaps) == ["c0", "c1"]
     assert np.allclose(list(gaps.values()), [0.7, 0.7])
+
+
+def stopping_hand(phase: str = "acting") -> tuple[Event, EventReply]:
+    """Somebody who holds out a hand at x = 12, in the middle of the sidewalk."""
+    event = Event(id="e0", kind="gesturing", x_m=12.0, y_m=0.0, heading_rad=0.0, route_s_m=12.0, half_width_m=1.5)
+    walker = Walker(x_m=12.0, y_m=0.0, heading_rad=math.pi)
+    state = EventState(phase=phase, since_tick=0, walkers=(walker,))  # type: ignore[arg-type]
+    return event, EventReply(episode="t", tick=0, states=(state,), actors=())
+
+
+@pytest.mark.parametrize(("x_m", "speed", "ended"), [(9.2, 0.0, "stop"), (8.8, 0.0, None), (9.2, 0.06, None)])
+def test_a_stop_before_the_hand_ends_the_episode_well(x_m: float, speed: float, ended: str | None) -> None:
+    """Within 3 m in front, slower than 0.05 m/s, for two seconds and not before; farther away or rolling does not."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    verdicts = judge_all(one, [step(t, x_m, speed=speed, events=reply) for t in range(45)])
+    first = next((t for t, v in enumerate(verdicts) if v.ended), None)
+    assert (None if first is None else verdicts[first].ended) == ended
+    assert ended is None or first == 39
+
+
+def test_a_stop_interrupted_begins_anew_and_one_before_the_trigger_does_not_count() -> None:
+    """Two seconds in one piece, while the hand is held out."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    steps = [step(t, 9.2, speed=0.5 if t == 30 else 0.0, events=reply) for t in range(60)]
+    assert all(v.ended is None for v in judge_all(one, steps))
+    _, waiting = stopping_hand("waiting")
+    other = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    assert all(v.ended is None for v in judge_all(other, [step(t, 9.2, speed=0.0, events=waiting) for t in range(60)]))
+
+
+def test_passing_the_hand_ends_the_episode_badly() -> None:
+    """Beyond the pedestrian there is nothing left to stop for, at the goal neither."""
+    event, reply = stopping_hand()
+    one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
+    assert one.judge(step(0, 11.9, events=reply)).ended is None
+    verdict = one.judge(step(1, 12.1, events=reply))
+    assert verdict.ended == "failure" and verdict.failure is None
