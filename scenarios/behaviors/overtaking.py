@@ -41,7 +41,7 @@ def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
 
 
 def _doing(event: Event, state: EventState, number: int) -> Doing:
-    return "phone" if state.phase == "waiting" else "stand"
+    return "stand"
 
 
 OVERTAKING: Final = Behavior(behind(TRIGGER_M), _begin, _act, _doing)
