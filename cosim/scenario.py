@@ -6,7 +6,9 @@ A spec is complete: the same spec gives the same episode, bit for bit, in any pr
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Literal
 
 import msgspec
@@ -203,13 +205,18 @@ def content_hash(spec: msgspec.Struct) -> str:
     return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
 
 
+ADDED: Mapping[str, object] = MappingProxyType({"light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0})
+"""Fields that came later, with the values that mean what was meant before there were such fields."""
+
+
 def _canonical(spec: msgspec.Struct) -> bytes:
-    """JSON of a spec. The light of a scenario is left out where it is the default, so that a spec that does not
-    speak of light has the bytes and the hash it had before there was light."""
+    """JSON of a spec. What was ADDED is left out of scenarios and events where it says nothing new, so that a spec has
+    the bytes and the hash it had before."""
     tree = msgspec.to_builtins(spec, order="deterministic")
     for scenario in tree.get("scenarios", [tree]):
-        if scenario.get("light") == {}:
-            del scenario["light"]
+        for part in (scenario, *scenario.get("events", ())):
+            for field in [name for name, before in ADDED.items() if part.get(name) == before]:
+                del part[field]
     return msgspec.json.encode(tree)
 
 
