@@ -11,6 +11,7 @@ import shapely
 
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import Lane, Port, StreetMap, Strip
+from cosim.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
 from cosim.walks import WalkGraph
 
 NARROW_M = 1.0
@@ -18,8 +19,6 @@ NARROW_M = 1.0
 STUB_M = 1.0
 STEEP = 0.08
 """Grade from which a walkable lane counts as steep."""
-FALSE_GRADE = 0.25
-"""Grade that no street has: the elevation is wrong there."""
 MOSTLY = 0.5
 START_M = 30.0
 """Routes start and end on sidewalks at least this long."""
@@ -183,7 +182,7 @@ def check_map(
         unit_possible=not unit,
         long_horizon_possible=not long_horizon,
         reasons=tuple(reasons),
-        notes=tuple([*unit, *long_horizon, *_notes(facts)] if not reasons else _notes(facts)),
+        notes=(*(() if reasons else (*unit, *long_horizon)), *_land_notes(street_map.elevation), *_notes(facts)),
         problems=tuple(marked),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
@@ -240,10 +239,12 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
 
 
 def _starts(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[Strip]:
+    steep = street_map.elevation.steep if street_map.elevation is not None else ()
     return [
         s
         for s in street_map.strips.values()
         if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= NARROW_M
+        if s.id not in steep
     ]
 
 
@@ -261,7 +262,7 @@ def _long_horizon_reasons(street_map: StreetMap, graph: WalkGraph, lengths: dict
     for start in starts[:: max(1, len(starts) // PROBES)]:
         for end in (0, 1):
             leave = Port(start.id, 1 if end else 0)
-            reach = graph.reach(leave, frozenset({leave.other}), limit_m=ROUTE_M[1])
+            reach = graph.reach(leave, street_map.too_steep | {leave.other}, limit_m=ROUTE_M[1])
             for goal in reach.within(*ROUTE_M):
                 way = reach.path(goal) if goal.strip in ends else None
                 if way and any(street_map.strips[port.strip].kind == "crossing" for port in way):
@@ -282,13 +283,6 @@ def _notes(facts: NetFacts | None) -> list[str]:
     if facts is None:
         return []
     notes = []
-    if facts.elevation_m is not None:
-        low, high = facts.elevation_m
-        notes.append(
-            f"elevation {low:.0f} to {high:.0f} m is in the net but not used: the ground is flat at present; "
-            f"{facts.steep} walkable lanes are steeper than {STEEP:.0%}, {facts.false_grades} than {FALSE_GRADE:.0%} "
-            "(false elevations)"
-        )
     if facts.mixed_km >= 0.01:
         notes.append(f"{facts.mixed_km:.2f} km that people share with cars are not walkable here")
     if facts.levels:
@@ -306,6 +300,25 @@ def _notes(facts: NetFacts | None) -> list[str]:
             notes.append(f"{len(found)} signalised crossings are {words}: {_some(found)}")
     if facts.misfits:
         notes.append(f"{len(facts.misfits)} crossings are beyond their signal's program: {_some(facts.misfits)}")
+    return notes
+
+
+def _land_notes(elevation: Elevation | None) -> list[str]:
+    if elevation is None:
+        return []
+    span = f"elevation {round(elevation.low_m)} to {round(elevation.high_m)} m"
+    if elevation.dropped:
+        return [f"{span} is dropped, the ground is flat: {elevation.dropped}"]
+    notes = [
+        f"{span} is kept; {elevation.missing} of {elevation.points} points had none or a false one and were "
+        f"interpolated; {elevation.clamped} places on streets were moved, by up to {elevation.moved_m:.1f} m, so that "
+        f"no street or walkway rises more than {WALK_GRADE_MAX:.0%} along its line"
+    ]
+    if elevation.steep:
+        notes.append(
+            f"{len(elevation.steep)} walkways are steeper than {ROBOT_GRADE_MAX:.0%} somewhere (steps, hill paths, "
+            "terraces closer together than heights can show): no robot is sent over them"
+        )
     return notes
 
 

@@ -18,6 +18,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.errors import MapError
 from cosim.geometry import Floats
+from cosim.terrain import Elevation, Terrain
 
 SEAM_M = 0.05
 """Gaps up to twice this between neighbouring walkable pieces count as closed."""
@@ -135,6 +136,7 @@ class StreetMap:
 
     bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the features where
     there are any. features: what the map shows beside its streets; none of it stands in the way.
+    terrain: None where the place is flat; elevation: what became of the net's elevations, None when it has none.
     """
 
     name: str
@@ -146,9 +148,19 @@ class StreetMap:
     net_hash: str = ""
     left_hand: bool = False
     features: tuple[Feature, ...] = ()
+    terrain: Terrain | None = None
+    elevation: Elevation | None = None
     _trees: dict[str, tuple[shapely.STRtree, tuple[Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )
+
+    @cached_property
+    def too_steep(self) -> frozenset[Port]:
+        """Ports that no robot is sent past because the land is too steep there; people pass."""
+        if self.elevation is None:
+            return frozenset()
+        whole = {port for strip in self.elevation.steep for port in (Port(strip, 0), Port(strip, 1))}
+        return frozenset(whole | {Port(strip, 1 if end else 0) for strip, end in self.elevation.closed})
 
     def near(self, kind: PieceKind, area: shapely.Geometry) -> list[Piece]:
         """Pieces of `kind` whose polygon touches `area`, in the net's order."""

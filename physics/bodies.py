@@ -96,15 +96,16 @@ class Bodies:
         return ground
 
     def _add_building(self, building: Building) -> list[int]:
-        boxes = [((building.x_m, building.y_m), building.heading_rad, building.size_m)]
+        height = building.size_m[2] + building.floor_m - building.base_m
+        boxes = [((building.x_m, building.y_m), building.heading_rad, (*building.size_m[:2], height))]
         if building.outline is not None:
-            boxes = [_wall_box(wall, building.size_m[2]) for wall in building.walls]
+            boxes = [_wall_box(wall, height) for wall in building.walls]
         bodies = []
         for (x, y), heading, size in boxes:
             half = [0.5 * s for s in size]
             shape = self._do("createCollisionShape", p.GEOM_BOX, halfExtents=half)
             turn = p.getQuaternionFromEuler((0.0, 0.0, heading))
-            bodies.append(self._body(shape, (x, y, CURB_M + half[2]), turn))
+            bodies.append(self._body(shape, (x, y, building.base_m + CURB_M + half[2]), turn))
             self._what[bodies[-1]] = ("wall", building.id)
         return bodies
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from cosim.geometry import Polyline
 from cosim.streetmap import Lane, PieceKind, StreetMap, Strip
+from cosim.terrain import Terrain
 from physics.mesh import Mesh, box, join, quads
 from physics.tiles import CURB_M, Key, key_at, square
 
@@ -44,7 +45,7 @@ Wall = tuple[float, float, float, float]
 @dataclass(frozen=True, slots=True)
 class Building:
     """A box on the high ground. size_m: along the street, away from it, height. heading_rad: along the sidewalk,
-    the street to its right.
+    the street to its right. floor_m, base_m: the land at its front, and the lowest under it.
 
     A building of the map has an outline and walls of its own; the box is then the one around it.
     """
@@ -57,6 +58,8 @@ class Building:
     facade: int
     outline: shapely.Polygon | None = None
     walls: tuple[Wall, ...] = ()
+    floor_m: float = 0.0
+    base_m: float = 0.0
 
     @property
     def polygon(self) -> shapely.Polygon:
@@ -157,6 +160,19 @@ def _between(line: Polyline, at_m: float, lot_m: float) -> NDArray[np.bool_]:
     return inside
 
 
+def on_land(building: Building, terrain: Terrain) -> Building:
+    """The building with a base down to the lowest land around it, and its floor level with the land at its front; the
+    floor of a building of the map, of which this may be a part, is known already."""
+    around = shapely.get_coordinates(shapely.segmentize(building.polygon.exterior, 1.0))
+    lowest = float(terrain.height(around).min())
+    if building.outline is not None:
+        return replace(building, base_m=min(building.floor_m, lowest))
+    away = 0.5 * building.size_m[1]
+    front = building.x_m + away * math.sin(building.heading_rad), building.y_m - away * math.cos(building.heading_rad)
+    floor = float(terrain.height([front])[0])
+    return replace(building, floor_m=floor, base_m=min(floor, lowest))
+
+
 def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
     """Walls and roofs by facade; -1 for the windows and doors on the side towards the street."""
     walls: dict[int, list[Mesh]] = {}
@@ -164,26 +180,29 @@ def facade_meshes(buildings: tuple[Building, ...]) -> dict[int, Mesh]:
         if b.outline is not None:
             walls.setdefault(b.facade, []).append(_outlined(b, b.outline))
             walls.setdefault(-1, []).append(_windows(b))
-            continue
-        width, deep, height = b.size_m
-        body = box((width, deep, height), (0.0, 0.0, 0.5 * height), skip=("bottom",))
-        at = (b.x_m, b.y_m, CURB_M)
-        walls.setdefault(b.facade, []).append(body.moved(at, b.heading_rad))
-        walls.setdefault(-1, []).append(_openings(b).moved(at, b.heading_rad))
+        else:
+            width, deep, height = b.size_m
+            body = box((width, deep, height), (0.0, 0.0, 0.5 * height), skip=("bottom",))
+            at = (b.x_m, b.y_m, b.floor_m + CURB_M)
+            walls.setdefault(b.facade, []).append(body.moved(at, b.heading_rad))
+            walls.setdefault(-1, []).append(_openings(b).moved(at, b.heading_rad))
+        if b.base_m < b.floor_m:
+            walls[b.facade].append(_base(b))
     return {facade: join(meshes) for facade, meshes in sorted(walls.items())}
 
 
 def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
     """Walls and the flat roof of a building of the map."""
     x0, y0, x1, y1 = np.array(building.walls).reshape(-1, 4).T
-    low, high = np.full(len(x0), CURB_M), np.full(len(x0), CURB_M + building.size_m[2])
+    ground, roof_m = building.floor_m + CURB_M, building.floor_m + CURB_M + building.size_m[2]
+    low, high = np.full(len(x0), ground), np.full(len(x0), roof_m)
     at = [np.column_stack(corner) for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))]
     corners = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
     roof = corners.reshape(-1, 4, 2)[:, :3]
     one, two = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
     under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
     roof[under] = roof[under][:, ::-1]
-    top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), high[0] if len(high) else building.size_m[2])])
+    top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
     up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
     return join([quads(np.stack(at, axis=1)), Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3))])
 
@@ -195,8 +214,20 @@ def _windows(building: Building) -> Mesh:
         length, heading = math.hypot(x1 - x0, y1 - y0), math.atan2(y1 - y0, x1 - x0)
         if length >= _WINDOW_WALL_M:
             wall = Building("", 0.0, 0.0, 0.0, (length, 0.0, building.size_m[2]), 0)
-            found.append(_openings(wall).moved((0.5 * (x0 + x1), 0.5 * (y0 + y1), CURB_M), heading))
+            found.append(_openings(wall).moved((0.5 * (x0 + x1), 0.5 * (y0 + y1), building.floor_m + CURB_M), heading))
     return join(found)
+
+
+def _base(building: Building) -> Mesh:
+    """Blank walls from the floor down to the lowest land."""
+    if building.outline is not None:
+        a, b = np.array(building.walls).reshape(-1, 2, 2).transpose(1, 0, 2)
+    else:
+        ring = shapely.get_coordinates(shapely.orient_polygons(building.polygon).exterior)
+        a, b = ring[:-1], ring[1:]
+    low, high = np.full(len(a), building.base_m), np.full(len(a), building.floor_m + CURB_M)
+    at = [np.column_stack(corner) for corner in ((a, low), (b, low), (b, high), (a, high))]
+    return quads(np.stack(at, axis=1))
 
 
 def _openings(building: Building) -> Mesh:

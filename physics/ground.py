@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from cosim.errors import UsageError
 from cosim.geometry import Floats, Pose
 from cosim.streetmap import StreetMap
-from physics.buildings import Building, Frontage
+from physics.buildings import Building, Frontage, on_land
 from physics.furniture import Prop
 from physics.mapped import MappedThings
 from physics.materials import Paving
@@ -22,6 +22,8 @@ from physics.robots import RobotModel
 from physics.tiles import Key, Tile, build_tile, key_at, square
 
 _KEPT: Final = 100
+_WHEELS: Final = np.array([0.32, 0.4])
+"""Where a vehicle's wheels are, as shares of its length and width from its middle."""
 
 
 class Ground:
@@ -52,14 +54,53 @@ class Ground:
         return self._tiles[key]
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
-        """Buildings whose centre lies in the tile."""
-        return self._frontage.in_tile(key)
+        """Buildings whose centre lies in the tile, on their land."""
+        buildings, terrain = self._frontage.in_tile(key), self.street_map.terrain
+        return buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
         """Props whose middle lies in the tile, each with the height of its foot in metres."""
         props = self._placement.in_tile(key)
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
+        if self.street_map.terrain is not None and props:
+            sizes = np.array([prop.size_m[:2] for prop in props])
+            heights = heights - self._fall([(p.x_m, p.y_m) for p in props], [p.heading_rad for p in props], sizes)
         return tuple(zip(props, heights.tolist(), strict=True))
+
+    def foot(self, x_m: float, y_m: float, heading_rad: float, size_m: tuple[float, float]) -> float:
+        """Height of the foot of a level thing of some length (along its heading) and width: nothing of it floats."""
+        height = float(self.heights([[x_m, y_m]])[0])
+        if self.street_map.terrain is None:
+            return height
+        return height - float(self._fall([(x_m, y_m)], [heading_rad], [size_m])[0])
+
+    def road(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
+        """(N, 3) height, roll and pitch of N vehicles at (N, 2) points, (N, 2) long and wide, on their wheels."""
+        size = np.asarray(size_m, dtype=float).reshape(-1, 2)
+        land = self._land_around(xy, heading_rad, _WHEELS * size)
+        if land is None:
+            return np.zeros((len(size), 3))
+        front_left, front_right, rear_left, rear_right = land.T
+        pitch = np.arctan2(rear_left + rear_right - front_left - front_right, 4.0 * _WHEELS[0] * size[:, 0])
+        roll = np.arctan2(front_left + rear_left - front_right - rear_right, 4.0 * _WHEELS[1] * size[:, 1])
+        return np.column_stack([land.mean(axis=1), roll, pitch])
+
+    def _fall(self, xy: ArrayLike, heading_rad: ArrayLike, size_m: ArrayLike) -> Floats:
+        """(N,) how far the land at the lowest corner of things lies below that at their middle."""
+        land = self._land_around(xy, heading_rad, 0.5 * np.asarray(size_m, dtype=float).reshape(-1, 2))
+        if land is None or self.street_map.terrain is None:
+            return np.zeros(len(np.asarray(xy).reshape(-1, 2)))
+        return np.asarray(np.maximum(self.street_map.terrain.height(xy) - land.min(axis=1), 0.0))
+
+    def _land_around(self, xy: ArrayLike, heading_rad: ArrayLike, half_m: Floats) -> Floats | None:
+        """(N, 4) land at the corners of N rectangles: front left, front right, rear left, rear right; None if flat."""
+        if self.street_map.terrain is None:
+            return None
+        at, heading = np.asarray(xy, dtype=float).reshape(-1, 2), np.asarray(heading_rad, dtype=float)
+        ahead = half_m[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
+        left = half_m[:, 1:] * np.column_stack([-np.sin(heading), np.cos(heading)])
+        corners = np.stack([at + ahead + left, at + ahead - left, at - ahead + left, at - ahead - left], axis=1)
+        return self.street_map.terrain.height(corners.reshape(-1, 2)).reshape(-1, 4)
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
         """Props in the tiles that an area touches."""

@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.streetmap import Feature, StreetMap
+from cosim.terrain import Terrain
 from physics.buildings import FACADES, Building, Wall
 from physics.furniture import KINDS, VARIANTS, Prop
 from physics.tiles import Key, key_at, square
@@ -33,6 +34,7 @@ class MappedThings:
         for feature in street_map.features:
             by_kind[feature.kind].append(feature)
         self._houses = by_kind.pop("building", [])
+        self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
         self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
         self._trees = {
             kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features]) for kind, features in by_kind.items()
@@ -59,7 +61,7 @@ class MappedThings:
             parts = shapely.get_parts(shapely.intersection(self._houses[i].polygon, tile))
             solid = [part for part in parts if isinstance(part, Polygon) and part.area > _SPLINTER_M2]
             found += [
-                _building(self._houses[i], part, f"building:map:{i}:{key[0]}:{key[1]}:{k}")
+                _building(self._houses[i], part, f"building:map:{i}:{key[0]}:{key[1]}:{k}", self._floors_m[i])
                 for k, part in enumerate(solid)
             ]
         return tuple(found)
@@ -82,7 +84,14 @@ def _prop(number: int, feature: Feature) -> Prop:
     return Prop(f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint)
 
 
-def _building(house: Feature, part: Polygon, name: str) -> Building:
+def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
+    """The floor of a house: as high as the land around it, on average."""
+    if terrain is None:
+        return 0.0
+    return float(terrain.height(shapely.get_coordinates(shapely.segmentize(whole.exterior, 1.0))).mean())
+
+
+def _building(house: Feature, part: Polygon, name: str, floor_m: float) -> Building:
     part = shapely.orient_polygons(part)
     x0, y0, x1, y1 = part.bounds
     drawn = zlib.crc32(f"{house.x_m:.2f},{house.y_m:.2f}".encode())
@@ -95,6 +104,8 @@ def _building(house: Feature, part: Polygon, name: str) -> Building:
         facade=drawn % len(FACADES),
         outline=part,
         walls=_walls(part, house.polygon),
+        floor_m=floor_m,
+        base_m=floor_m,
     )
 
 

@@ -55,7 +55,8 @@ class Scene:
         self._painted: dict[int, Colour] = {}
         self._robot = canvas.load(model.urdf, "robot")
         for barrier in barriers:
-            z = float(ground.heights([[barrier.x_m, barrier.y_m]])[0])
+            size = (barrier.thickness_m, barrier.length_m)
+            z = ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
             for mesh, colour in zip(props.barrier_meshes(barrier), (props.RED, props.WHITE), strict=True):
                 body = canvas.add(mesh, colour, "barrier")
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
@@ -131,13 +132,19 @@ class Scene:
     def _show_vehicles(self, view: View, which: Vehicles) -> None:
         for rigs in self._vehicles.values():
             rigs.start()
-        for i in view.rows(which.xy, VEHICLE_MARGIN_M):
+        rows = view.rows(which.xy, VEHICLE_MARGIN_M)
+        leans = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows]).tolist()
+        for i, (z, roll, pitch) in zip(rows.tolist(), leans, strict=True):
             size = (round(float(which.size[i, 0]), 1), round(float(which.size[i, 1]), 1))
             if size not in self._vehicles:
                 self._vehicles[size] = Rigs(self._canvas, vehicles.vehicle_meshes(*size), "vehicle")
             colours = (vehicles.paint(which.ids[i]), vehicles.GLASS, vehicles.TYRE)
             for body, colour in zip(self._vehicles[size].lend(), colours, strict=True):
-                self._canvas.put(body, (float(which.xy[i, 0]), float(which.xy[i, 1]), 0.0), float(which.heading[i]))
+                at = (float(which.xy[i, 0]), float(which.xy[i, 1]), z)
+                if roll or pitch:
+                    self._canvas.put_turned(body, at, (roll, pitch, float(which.heading[i])))
+                else:
+                    self._canvas.put(body, at, float(which.heading[i]))
                 self._canvas.paint(body, colour)
         for rigs in self._vehicles.values():
             rigs.finish()

@@ -4,6 +4,9 @@ Road and crossings lie at height 0, everything else at CURB_M above; towards a c
 driveway, the high ground sinks with a slope of 1:12, so that a curb ramp and its flares come from one formula:
 min(CURB_M, distance / 12).
 
+On hilly places all this lies on the terrain, and the sides of the terrain's triangles divide the faces: the ground's
+triangles lie in the terrain's planes.
+
 A tile is one planar arrangement: all outlines are noded together on a millimetre grid, the faces between them
 are classified and triangulated. Neighbouring faces share their vertices, so there are no cracks.
 """
@@ -21,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import PieceKind, StreetMap, Strip, union_closed
+from cosim.terrain import Terrain
 from physics.materials import PAVINGS, Paving, cuts
 from physics.mesh import Mesh, quads
 from physics.relief import Relief, potholes
@@ -79,11 +83,12 @@ class Tile:
     low: shapely.Geometry
     crossings: shapely.Geometry
     relief: Relief | None = None
+    terrain: Terrain | None = None
 
     def height(self, xy: ArrayLike) -> Floats:
         """Height of the ground at (N, 2) points in the square, (N,) metres."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
-        low, high = _heights(xy, self.crossings, self.relief)
+        _, low, high = _heights(xy, self.crossings, self.relief, self.terrain)
         return np.where(shapely.contains_xy(self.low, xy[:, 0], xy[:, 1]), low, high)
 
 
@@ -134,13 +139,16 @@ def build_tile(
         holes = potholes(zones["road"], square(key), roughness, seed)
         relief = Relief(roughness, seed, np.asarray(roots, dtype=float).reshape(-1, 2), holes)
         ends = np.concatenate([ends, relief.lines(zones["pavement"], square(key))])
+    terrain = street_map.terrain
+    if terrain is not None:
+        ends = np.concatenate([ends, shapely.linestrings(terrain.creases(square(key)))])
     faces = _faces(border, zones, low, stripes, ends)
     points = shapely.get_coordinates(shapely.point_on_surface(faces))
     names = _classify(points, zones, stripes)
     if paving:
         names = paving.refined(names, points, pieces, reach)
-    parts = _triangulate(faces, names, zones["ramp_to"], relief)
-    return Tile(key, parts, low, zones["ramp_to"], relief)
+    parts = _triangulate(faces, names, zones["ramp_to"], relief, terrain)
+    return Tile(key, parts, low, zones["ramp_to"], relief, terrain)
 
 
 def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, shapely.Geometry], shapely.Geometry]:
@@ -260,7 +268,11 @@ def _classify(point: Floats, zones: Mapping[str, shapely.Geometry], stripes: sha
 
 
 def _triangulate(
-    faces: NDArray[np.object_], names: Sequence[str], ramp_to: shapely.Geometry, relief: Relief | None
+    faces: NDArray[np.object_],
+    names: Sequence[str],
+    ramp_to: shapely.Geometry,
+    relief: Relief | None,
+    terrain: Terrain | None,
 ) -> dict[str, Mesh]:
     """A mesh for each surface, walls of the curbs included."""
     triangle, face = shapely.get_parts(shapely.constrained_delaunay_triangles(faces), return_index=True)
@@ -271,30 +283,32 @@ def _triangulate(
     grid, index = np.unique(np.rint(corners.reshape(-1, 2) / _GRID_M).astype(np.int64), axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     xy: Floats = grid.astype(float) * _GRID_M
-    low, high = _heights(xy, ramp_to, relief)
+    land, low, high = _heights(xy, ramp_to, relief, terrain)
     found = [*SURFACES, *sorted(set(names) - SURFACES.keys())]
     surface_of = np.array([found.index(name) for name in names])[face]
     lies_low = np.array([kind_of(name) in _LOW for name in found])
     parts = {
-        name: _flat(xy, low if lies_low[i] else high, triangles[surface_of == i], relief is not None)
+        name: _flat(
+            xy, low if lies_low[i] else high, triangles[surface_of == i], relief is not None or terrain is not None
+        )
         for i, name in enumerate(found)
     }
-    walls = _walls(xy, high, triangles, lies_low[surface_of])
+    walls = _walls(xy, land, high, triangles, lies_low[surface_of])
     parts["curb"] = _append(parts["curb"], walls)
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
 
 
-def _walls(xy: Floats, high: Floats, triangles: NDArray[np.int64], is_low: NDArray[np.bool_]) -> Mesh:
-    """Upright faces wherever a low and a high triangle share an edge; they look towards the low side."""
+def _walls(xy: Floats, land: Floats, high: Floats, triangles: NDArray[np.int64], is_low: NDArray[np.bool_]) -> Mesh:
+    """Upright faces from the land up wherever a low and a high triangle share an edge; they look to the low side."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     low = np.tile(is_low, 3)
     codes = edges[:, 0] * len(xy) + edges[:, 1]
     twins = edges[:, 1] * len(xy) + edges[:, 0]
     step = low & np.isin(twins, codes[~low])
     a, b = edges[step].T
-    keep = np.maximum(high[a], high[b]) > 1e-4
+    keep = np.maximum(high[a] - land[a], high[b] - land[b]) > 1e-4
     a, b = a[keep], b[keep]
-    at = [np.column_stack([xy[i], z]) for i, z in ((b, 0.0 * high[b]), (a, 0.0 * high[a]), (a, high[a]), (b, high[b]))]
+    at = [np.column_stack([xy[i], z]) for i, z in ((b, land[b]), (a, land[a]), (a, high[a]), (b, high[b]))]
     walls = quads(np.stack(at, axis=1))
     one, two = (walls.vertices[walls.triangles[:, i]] - walls.vertices[walls.triangles[:, 0]] for i in (1, 2))
     real = np.linalg.norm(np.cross(one, two), axis=1) > 1e-9
@@ -327,12 +341,16 @@ def _append(a: Mesh, b: Mesh) -> Mesh:
     )
 
 
-def _heights(xy: Floats, ramp_to: shapely.Geometry, relief: Relief | None) -> tuple[Floats, Floats]:
-    """Heights of road and of high ground at (N, 2) points; the unevenness of pavement ends at the ramps."""
-    high = _raised(xy, ramp_to)
-    if relief is None:
-        return np.zeros(len(xy)), high
-    return relief.on_road(xy), high + relief.on_pavement(xy) * high / CURB_M
+def _heights(
+    xy: Floats, ramp_to: shapely.Geometry, relief: Relief | None, terrain: Terrain | None
+) -> tuple[Floats, Floats, Floats]:
+    """Heights of the land, of the road and of high ground at (N, 2) points; the unevenness of pavement ends at the
+    ramps."""
+    land = np.zeros(len(xy)) if terrain is None else terrain.height(xy)
+    low, high = land, _raised(xy, ramp_to)
+    if relief is not None:
+        low, high = land + relief.on_road(xy), high + relief.on_pavement(xy) * high / CURB_M
+    return land, low, high if terrain is None else land + high
 
 
 def _raised(xy: Floats, ramp_to: shapely.Geometry) -> Floats:

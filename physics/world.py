@@ -63,7 +63,8 @@ class BulletWorld:
         if self._bodies is None:
             self._bodies = Bodies(self.model, SUBSTEP_S)
             for barrier in self.barriers:
-                z = self.height_at(barrier.x_m, barrier.y_m)
+                size = (barrier.thickness_m, barrier.length_m)
+                z = self.ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
                 self._bodies.add_barrier(barrier, z)
         return self
 
@@ -108,7 +109,8 @@ class BulletWorld:
         people_poses, car_poses = people.poses(substeps), cars.poses(substeps)
         people_z = self.ground.heights(people_poses[-1, :, :2]) if len(people) else np.zeros(0)
         bodies.show("pedestrian", people.ids, people_z)
-        bodies.show("vehicle", cars.ids, np.zeros(len(cars)), 2.0 * car_half)
+        cars_z = self.ground.road(car_poses[-1, :, :2], car_poses[-1, :, 2], 2.0 * car_half)[:, 0]
+        bodies.show("vehicle", cars.ids, cars_z, 2.0 * car_half)
 
         trace = np.empty((substeps, 3))
         found: list[Contact] = []

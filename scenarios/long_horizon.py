@@ -40,6 +40,7 @@ def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scen
         strip_id
         for strip_id in graph.main_strips
         if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= STRIP_MIN_M
+        if Port(strip_id, 0) not in street_map.too_steep
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")
@@ -94,7 +95,7 @@ def draw_way(
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
-    closed = frozenset({leave.other})
+    closed = street_map.too_steep | {leave.other}
     reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
     goals = [port for port in reach.within(target_m - start_m - 60.0, target_m - start_m) if port.strip in candidates]
     if not goals:

@@ -108,6 +108,9 @@ def _maker(kind: Any) -> _Maker:
         return lambda number, pools: pools[0][number]
     if kind is Polygon or MultiPolygon in parts:
         return lambda number, pools: pools[1][number]
+    if type(None) in parts and len(parts) == 2:
+        value = _maker(parts[0])
+        return lambda found, pools: None if found is None else value(found, pools)
     if is_dataclass(kind) or hasattr(kind, "_fields"):
         return _made_of(kind)
     if origin is Mapping:

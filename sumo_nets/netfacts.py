@@ -14,7 +14,8 @@ from pathlib import Path
 import shapely
 
 from cosim.errors import MapError
-from cosim.mapcheck import FALSE_GRADE, STEEP, NetFacts
+from cosim.mapcheck import STEEP, NetFacts
+from cosim.terrain import FALSE_GRADE
 
 GO = frozenset("Gg")
 GROUND = ("no", "", "building_passage")

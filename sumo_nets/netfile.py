@@ -12,7 +12,7 @@ import subprocess
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 from xml.parsers import expat
@@ -24,6 +24,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from cosim.errors import MapError
 from cosim.geometry import Floats
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
+from sumo_nets.elevation import land_of, steep_ports, steep_strips
 from sumo_nets.outlines import areas_of, bands, coordinates, polylines
 from sumo_nets.seams import close_seams
 
@@ -210,18 +211,27 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         )
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
     }
+    apart = {edge.attributes["id"] for edge in raw.edges if all(map(_only_walked, edge.lanes))}
+    terrain, elevation = land_of(raw.edges, apart, {name: index for name, (_, _, index) in walk.items()}, ports)
     at: dict[str, list[Port]] = defaultdict(list)
     for (strip, end), corner in ports.items():
         at[corner].append(Port(strip, 1 if end else 0))
+    meeting = {c: Corner(id=c, polygon=polygon, ports=tuple(at[c])) for c, polygon in corners.items()}
+    if terrain is not None and elevation is not None:
+        steep = steep_strips(terrain, tuple(strips.values()))
+        closed = steep_ports(terrain, strips, meeting.values(), frozenset(steep))
+        elevation = replace(elevation, steep=steep, closed=closed)
     return StreetMap(
         name=re.sub(r"(\.net)?\.xml(\.gz)?$", "", path.name),
         bounds=_bounds(raw, lines),
         strips=strips,
-        corners={c: Corner(id=c, polygon=polygon, ports=tuple(at[c])) for c, polygon in corners.items()},
+        corners=meeting,
         lanes=roads,
         junctions=_junctions(raw.junctions),
         net_hash=net_hash,
         left_hand=left_hand,
+        terrain=terrain,
+        elevation=elevation,
     )
 
 

@@ -15,6 +15,7 @@ from cosim.errors import MapError
 from cosim.mapcheck import NetFacts, check_map
 from cosim.report.mapsheet import MARKS, SIGNAL, draw_map
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
+from cosim.terrain import Elevation
 from sumo_nets.netfacts import facts_of, walks_of
 from sumo_nets.netfile import read_net
 
@@ -171,11 +172,16 @@ def test_facts_of_a_net() -> None:
 
 
 def test_notes_say_what_is_not_used() -> None:
-    """Elevations that are dropped, bridges, level crossings and dead signals are named in words."""
-    notes = "\n".join(check_map(town(), None, facts_of(net())).notes)
+    """Elevations that are dropped or changed, bridges, level crossings and dead signals are named in words."""
+    land = Elevation(low_m=0.0, high_m=90.0, points=50, missing=7, false_share=0.1, clamped=3, moved_m=1.25)
+    false = dataclasses.replace(town(), elevation=dataclasses.replace(land, dropped="it is the same everywhere"))
+    assert "elevation 0 to 90 m is dropped, the ground is flat: it is the same" in check_map(false).notes[-1]
+    kept = dataclasses.replace(town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),)))
+    notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
     for words in (
-        "elevation 0 to 90 m is in the net but not used",
-        "1 than 25% (false elevations)",
+        "elevation 0 to 90 m is kept; 7 of 50 points had none or a false one",
+        "3 places on streets were moved, by up to 1.2 m",
+        "1 walkways are steeper than 20% somewhere",
         "0.20 km that people share with cars",
         "1 walkable edges (0.30 km) are on bridges",
         "1 walkable lanes name no width",

@@ -204,7 +204,7 @@ class Scene:
         return form[rows], here
 
     def _fence(self, barrier: Barrier) -> Placed:
-        z = float(self._ground.heights([[barrier.x_m, barrier.y_m]])[0])
+        z = self._ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
         form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.RED), Coat(white, props.WHITE)])
@@ -259,9 +259,13 @@ class Scene:
         forms = []
         for length, width in which.size[rows].round(1).tolist():
             forms.append(self._forms.id(("vehicle", length, width), partial(_vehicle, length, width)))
-        at = np.column_stack([which.xy[rows] - self._anchor, np.zeros(len(rows))])
+        lean = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows])
+        at = np.column_stack([which.xy[rows] - self._anchor, lean[:, 0]])
         paint = np.array([vehicles.paint(which.ids[i]) for i in rows])
-        return np.array(forms), instances(at, which.heading[rows], paint, LABELS["vehicle"])
+        placed = instances(at, which.heading[rows], paint, LABELS["vehicle"])
+        if lean.any():
+            placed["turn"] = [_quaternion(r, p, h) for (_, r, p), h in zip(lean, which.heading[rows], strict=True)]
+        return np.array(forms), placed
 
     def _robot(self, robot: RobotState) -> Placed:
         """The robot with its base frame at its pose, leaning with the ground."""

@@ -22,6 +22,7 @@ from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.mesh import Mesh
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import VARIANTS, WALL_STYLES
+from physics.tiles import CURB_M
 
 _CORNER: Final = np.dtype(
     [
@@ -154,7 +155,7 @@ def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[
         if colour is not None:
             rows["colour"] = *np.rint(255.0 * np.array(colour)), 255.0
             rows["colour"][flat] = 0
-        rows["spot"], storeys = _spots(mesh, flat)
+        rows["spot"], storeys = _spots(mesh, flat, building.floor_m + CURB_M)
         rows["kind"] = np.stack(
             [np.full(len(rows), upper), storeys, mesh.normals @ street > 0.9, np.full(len(rows), chance[0])], 1
         )
@@ -163,20 +164,20 @@ def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[
     return found
 
 
-def _spots(mesh: Mesh, flat: NDArray[np.bool_]) -> tuple[Floats, NDArray[np.int64]]:
-    """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows."""
+def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats, NDArray[np.int64]]:
+    """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows, none
+    below the floor."""
     spots, storeys = np.zeros((len(flat), 4)), np.zeros(len(flat), dtype=np.int64)
     spots[flat, :2] = mesh.vertices[flat, :2]
     spots[flat, 3] = -1.0
-    base = mesh.vertices[:, 2].min()
     walls = np.flatnonzero(~flat).reshape(-1, 4)  # upright faces are quads: four corners after each other
     for quad in walls:
         normal = mesh.normals[quad[0]]
         along = mesh.vertices[quad] @ np.array([-normal[1], normal[0], 0.0])
         along -= along.min()
-        up = mesh.vertices[quad, 2] - base
+        up = mesh.vertices[quad, 2] - floor_m
         width = along.max()
         count = max(round(width / BAY_M), 1)
         spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
-        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= _LEAST_M else 0
+        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= _LEAST_M and up.max() > 0.0 else 0
     return spots, storeys
