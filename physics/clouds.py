@@ -52,7 +52,9 @@ def clouded(clear: Floats, ways: Floats, sun: Floats, beam: Floats, cover: float
 def _layer(seed: int) -> Field:
     """(S, S) noise of the layer, its values spread evenly over 0 to 1, so that a cover is a threshold."""
     noise = Noise(_SIZE, (seed, 9001))
-    field = noise.warped(np.asarray(noise.clouds(4) + 0.45 * noise.clouds(16), np.float32), 0.012, 8)
+    field = noise.warped(
+        np.asarray(noise.clouds(4) + 0.6 * noise.clouds(16) + 0.15 * noise.clouds(64), np.float32), 0.012, 8
+    )
     order = np.argsort(np.argsort(field, axis=None)).reshape(field.shape)
     return np.asarray(order / order.size, dtype=np.float32)
 
@@ -62,4 +64,4 @@ def _dense(layer: Field, ways: Floats, cover: float, moved: Floats) -> Field:
     flat = ways[..., :2] / np.maximum(ways[..., 2:] + 0.12, 0.06) + moved
     at = (flat / _PER_SIDE % 1.0 * _SIZE).astype(np.float32)
     found = cv2.remap(layer, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP)
-    return step(1.0 - cover, 1.0 - cover + 0.30, np.asarray(found, np.float32))
+    return step(1.0 - cover, 1.0 - cover + 0.24, np.asarray(found, np.float32))

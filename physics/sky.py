@@ -23,7 +23,7 @@ from physics.clouds import clouded
 from physics.hdri import brightest, read_hdri
 from physics.sun import sun_direction, transmittance
 
-SKY_SIZE: Final = (128, 256)
+SKY_SIZE: Final = (256, 512)
 """Rows and columns of a procedural sky."""
 TURBIDITY: Final = 3.0
 GROUND_ALBEDO: Final = 0.2

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from typing import Final
 
 import numpy as np
 
-from physics.textures.bonds import basket, courses, herringbone, random_courses
+from physics.textures.bonds import Bond, basket, courses, herringbone, random_courses
 from physics.textures.layers import Colour, Generator, Layers, Picture, Recipe, stacked
 from physics.textures.noise import Field, Noise, blurred, cells, step
 from physics.textures.surface import bond_of, cracks, laid, mixed, plain, relief, shaded, stained
 
+_GRASS_TINT: Final = 0.3
+"""Grass has its own green: a tint only leans it."""
 _GREY: Final = ((0.57, 0.56, 0.54), (0.55, 0.54, 0.51), (0.59, 0.58, 0.56))
-_RED: Final = ((0.58, 0.36, 0.29), (0.54, 0.33, 0.27), (0.62, 0.40, 0.31), (0.50, 0.31, 0.27))
+_WORN: Final = (*_GREY, (0.52, 0.51, 0.48))
+_RED: Final = ((0.55, 0.39, 0.33), (0.51, 0.36, 0.31), (0.58, 0.42, 0.35), (0.48, 0.35, 0.31))
 _SAND: Final = (0.52, 0.49, 0.44)
 _DARK: Final = (0.36, 0.35, 0.34)
 
@@ -59,15 +62,25 @@ def _patches(noise: Noise) -> Field:
     return np.asarray(np.max(edges, axis=0) + 0.003 * noise.clouds(8), dtype=np.float32)
 
 
-def _stones(side_m: float, bond: Sequence[object], colours: Sequence[Colour], joint: Colour, **look: float) -> Recipe:
-    """A laid surface: `bond` is a function of bonds and its arguments after size and side."""
-    lay, *arguments = bond
+def _stones(
+    side_m: float,
+    lay: Callable[[int, float], Bond],
+    colours: Sequence[Colour],
+    joint: Colour,
+    tint: float = 1.0,
+    **look: float,
+) -> Recipe:
+    """A laid surface. lay: its bond, given pixels and side; tint: share of the tint in the stones."""
 
     def make(noise: Noise) -> Picture:
-        whole = laid(noise, lay(noise.size, side_m, *arguments), side_m, colours, joint, **look)  # type: ignore[operator]
-        return Picture(stained(whole.rgb, noise, 0.08), whole.alpha)
+        whole = laid(noise, lay(noise.size, side_m), side_m, colours, joint, **look)
+        return Picture(stained(whole.rgb, noise, 0.08), np.float32(tint) * np.asarray(whole.alpha))
 
     return Recipe(side_m, make)
+
+
+def _rows(rows: int, unit_m: Sequence[float], shift: Sequence[float] = (0.0,)) -> Callable[[int, float], Bond]:
+    return lambda size, side_m: courses(size, side_m, rows, unit_m, shift)
 
 
 def _setts(noise: Noise) -> Picture:
@@ -104,7 +117,8 @@ def _grass(dry: float, worn: float = 0.0) -> Generator:
         if worn:
             bare = np.float32(worn) * step(0.3, 2.0, noise.clouds(8) + 0.35 * blades)
             rgb = mixed(rgb, plain(noise, (0.43, 0.37, 0.29), 0.02, 0.04), bare)
-        return Picture(shaded(rgb, 1.0 + 0.04 * noise.clouds(8) + 0.06 * blades))
+        rgb = shaded(rgb, 1.0 + 0.04 * noise.clouds(8) + 0.06 * blades)
+        return Picture(rgb, np.full_like(tuft, _GRASS_TINT))
 
     return make
 
@@ -174,23 +188,21 @@ GROUND: Final[Mapping[str, Recipe]] = {
     "asphalt-patched": Recipe(6.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),
     "asphalt-fine": Recipe(2.0, _asphalt(0.035, 0.40)),
     "concrete-cast": Recipe(3.0, _cast),
-    "slabs-square": _stones(2.0, (courses, 5, [0.4], [0.0]), _GREY, _DARK, joint_m=0.007, spread=0.035),
-    "slabs-running": _stones(2.4, (courses, 6, [0.6], [0.0, 0.5]), _GREY, _DARK, joint_m=0.007, spread=0.035),
+    "slabs-square": _stones(2.0, _rows(5, [0.4]), _GREY, _DARK, joint_m=0.007, spread=0.035),
+    "slabs-running": _stones(2.4, _rows(6, [0.6], [0.0, 0.5]), _GREY, _DARK, joint_m=0.007, spread=0.035),
     "slabs-mixed": _stones(
-        2.4, (courses, 6, [0.6, 0.4, 0.2], [0.0, 0.39, 0.81]), _GREY, _DARK, joint_m=0.007, spread=0.045
+        2.4, _rows(6, [0.6, 0.4, 0.2], [0.0, 0.39, 0.81]), _GREY, _DARK, joint_m=0.007, spread=0.045
     ),
-    "slabs-worn": _stones(
-        2.0, (courses, 4, [0.5], [0.0]), (*_GREY, (0.54, 0.53, 0.50)), _SAND, joint_m=0.010, spread=0.045, clouds=0.03
+    "slabs-worn": _stones(2.0, _rows(4, [0.5]), _WORN, _SAND, joint_m=0.010, spread=0.045, clouds=0.03),
+    "pavers-running": _stones(1.6, _rows(16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-herringbone": _stones(1.6, lambda n, m: herringbone(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-basket": _stones(1.6, lambda n, m: basket(n, m, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
+    "pavers-mixed": _stones(1.8, _rows(12, [0.2, 0.15, 0.25], [0.0, 0.45, 0.2]), _WORN, _DARK, spread=0.06),
+    "brick-running": _stones(1.68, _rows(16, [0.21], [0.0, 0.5]), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07),
+    "brick-herringbone": _stones(
+        1.68, lambda n, m: herringbone(n, m, 0.105), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07
     ),
-    "pavers-running": _stones(1.6, (courses, 16, [0.2], [0.0, 0.5]), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-herringbone": _stones(1.6, (herringbone, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-basket": _stones(1.6, (basket, 0.1), _GREY, _DARK, joint_m=0.005, spread=0.05),
-    "pavers-mixed": _stones(
-        1.8, (courses, 12, [0.2, 0.15, 0.25], [0.0, 0.45, 0.2]), (*_GREY, (0.52, 0.50, 0.48)), _DARK, spread=0.06
-    ),
-    "brick-running": _stones(1.68, (courses, 16, [0.21], [0.0, 0.5]), _RED, _SAND, joint_m=0.007, spread=0.07),
-    "brick-herringbone": _stones(1.68, (herringbone, 0.105), _RED, _SAND, joint_m=0.007, spread=0.07),
-    "brick-basket": _stones(1.68, (basket, 0.105), _RED, _SAND, joint_m=0.007, spread=0.07),
+    "brick-basket": _stones(1.68, lambda n, m: basket(n, m, 0.105), _RED, _SAND, 0.6, joint_m=0.007, spread=0.07),
     "setts": Recipe(1.6, _setts),
     "cobbles": Recipe(1.6, _cobbles),
     "granite": Recipe(1.0, _granite),
