@@ -18,8 +18,9 @@ from cosim.geometry import Floats, Pose
 PERSON_RADIUS_M = 0.3
 """Radius of every pedestrian's collision cylinder."""
 
-Doing = Literal["walk", "stand", "look", "talk", "queue", "stop"]
-"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand."""
+Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone"]
+"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand, reading a
+phone."""
 
 
 def frozen(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -50,7 +51,9 @@ class RobotState:
 class People:
     """Pedestrians of a moment. ids: N unique names, sorted; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
 
-    Background walkers have ids that start with "c", event pedestrians with "e".
+    strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
+    shows, which follows the speed as one starts and stops (`cosim.gait`). Both are for pictures: nothing else reads
+    them. Background walkers have ids that start with "c", event pedestrians with "e".
     """
 
     ids: tuple[str, ...]
@@ -58,11 +61,43 @@ class People:
     heading: Floats
     speed: Floats
     doing: tuple[Doing, ...]
+    strides: Floats
+    pace: Floats
 
     @classmethod
-    def of(cls, ids: tuple[str, ...], xy: Any, heading: Any, speed: Any, doing: tuple[Doing, ...]) -> People:
+    def of(
+        cls,
+        ids: tuple[str, ...],
+        xy: Any,
+        heading: Any,
+        speed: Any,
+        doing: tuple[Doing, ...],
+        strides: Any = None,
+        pace: Any = None,
+    ) -> People:
+        """Without strides and pace: people at the beginning of a stride, at the pace of their speed."""
         n = len(ids)
-        return cls(ids, frozen(xy, shape=(n, 2)), frozen(heading, shape=(n,)), frozen(speed, shape=(n,)), doing)
+        return cls(
+            ids,
+            frozen(xy, shape=(n, 2)),
+            frozen(heading, shape=(n,)),
+            frozen(speed, shape=(n,)),
+            doing,
+            frozen(np.zeros(n) if strides is None else strides, shape=(n,)),
+            frozen(speed if pace is None else pace, shape=(n,)),
+        )
+
+    def only(self, rows: NDArray[np.intp]) -> People:
+        """Those in these rows."""
+        return People.of(
+            tuple(self.ids[i] for i in rows.tolist()),
+            self.xy[rows],
+            self.heading[rows],
+            self.speed[rows],
+            tuple(self.doing[i] for i in rows.tolist()),
+            self.strides[rows],
+            self.pace[rows],
+        )
 
     def __len__(self) -> int:
         return len(self.ids)

@@ -85,6 +85,10 @@ class Canvas:
     def put_turned(self, body: int, at_m: Sequence[float], roll_pitch_yaw: Sequence[float]) -> None:
         p.resetBasePositionAndOrientation(body, at_m, p.getQuaternionFromEuler(roll_pitch_yaw), self._client)
 
+    def put_at(self, body: int, at_m: Sequence[float], turn: Sequence[float]) -> None:
+        """Set a body at (3,) metres, turned by a quaternion x, y, z, w."""
+        p.resetBasePositionAndOrientation(body, at_m, turn, self._client)
+
     def put_away(self, body: int) -> None:
         p.resetBasePositionAndOrientation(body, _AWAY, _UPRIGHT, self._client)
 

@@ -12,11 +12,14 @@ from cosim.clock import Clock
 from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import People, Street, Vehicles
-from physics import people, props, vehicles
+from physics import props, vehicles
 from physics.buildings import FACADES, WINDOWS, facade_meshes
 from physics.canvas import Canvas, Colour, Rigs
 from physics.furniture import KINDS, Prop, parts_of
 from physics.ground import Ground
+from physics.people.families import FAMILIES
+from physics.people.looks import family_of
+from physics.people.parts import part_colours, part_meshes, placed
 from physics.robots import RobotModel
 from physics.tiles import Key, distance_to, keys_within, square, surface
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
@@ -48,7 +51,7 @@ class Scene:
         self._shown: set[Key] = set()
         self.built = 0
         self._post = canvas.shape(props.post_mesh())
-        self._walkers = Rigs(canvas, [part.mesh for part in people.PARTS], "person")
+        self._walkers = {family: Rigs(canvas, part_meshes(family), "person") for family in FAMILIES}
         self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
         self._vehicles: dict[tuple[float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int], Rigs] = {}
@@ -114,20 +117,19 @@ class Scene:
         return post.x_m, post.y_m, float(self._ground.heights([[post.x_m, post.y_m]])[0])
 
     def _show_people(self, view: View, who: People, time_s: float) -> None:
-        rows = view.rows(who.xy, PERSON_MARGIN_M)
-        z = self._ground.heights(who.xy[rows])
-        about_y, about_z = people.swings(who, time_s)
-        self._walkers.start()
-        for foot_z, i in zip(z.tolist(), rows.tolist(), strict=True):
-            x, y = who.xy[i].tolist()
-            heading, colours = float(who.heading[i]), people.colours(who.ids[i])
-            cos, sin = math.cos(heading), math.sin(heading)
-            for k, (body, part) in enumerate(zip(self._walkers.lend(), people.PARTS, strict=True)):
-                jx, jy, jz = part.joint_m
-                at = (x + cos * jx - sin * jy, y + sin * jx + cos * jy, foot_z + jz)
-                self._canvas.put(body, at, heading + float(about_z[i, k]), float(about_y[i, k]))
-                self._canvas.paint(body, colours[part.coat])
-        self._walkers.finish()
+        who = who.only(view.rows(who.xy, PERSON_MARGIN_M))
+        parts = placed(who, self._ground.heights(who.xy), time_s)
+        for rigs in self._walkers.values():
+            rigs.start()
+        for name, at, turn in zip(who.ids, parts.at_m.tolist(), parts.turn.tolist(), strict=True):
+            bodies = self._walkers[family_of(name)].lend()
+            for k, (body, colour) in enumerate(zip(bodies, part_colours(name), strict=True)):
+                self._canvas.put_at(body, at[k], turn[k])
+                if self._painted.get(body) != colour:
+                    self._painted[body] = colour
+                    self._canvas.paint(body, colour)
+        for rigs in self._walkers.values():
+            rigs.finish()
 
     def _show_vehicles(self, view: View, which: Vehicles) -> None:
         for rigs in self._vehicles.values():

@@ -21,6 +21,7 @@ import numpy as np
 
 from cosim.errors import EngineError
 from cosim.events import Actor, EventReply
+from cosim.gait import Strides
 from cosim.geometry import Pose, heading_from_sumo
 from cosim.giveway import Body
 from cosim.ports import Crowd
@@ -157,6 +158,7 @@ class SumoCrowd(Crowd):
         self._robot = Proxy(libsumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
         self._poses = PoseFilter(TICK_MS / 1000)
+        self._strides = Strides(TICK_MS / 1000)
         self._watch(x_m, y_m)
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
@@ -206,12 +208,16 @@ class SumoCrowd(Crowd):
         table = np.array(list(persons.values()), dtype=float).reshape(-1, 5)
         xy, heading, speed = self._poses.update(ids, table[:, :2], table[:, 2], table[:, 3], body)
         cast = sorted(actors, key=lambda actor: actor.id)
+        names = (*ids, *(a.id for a in cast))
+        places = np.concatenate([xy, np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)])
+        speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
         return People.of(
-            (*ids, *(a.id for a in cast)),
-            np.concatenate([xy, np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)]),
+            names,
+            places,
             np.concatenate([heading, [a.heading_rad for a in cast]]),
-            np.concatenate([speed, [a.speed_mps for a in cast]]),
+            speeds,
             (*("walk" if fast else "stand" for fast in speed > STANDING_MPS), *(a.doing for a in cast)),
+            *self._strides.update(names, places, speeds),
         )
 
     def _vehicles(self, vehicles: dict[str, Row]) -> Vehicles:

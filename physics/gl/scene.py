@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from cosim.clock import Clock
 from cosim.geometry import Floats
 from cosim.scenario import Barrier
-from cosim.state import LABELS, People, RobotState, Street, Vehicles
-from physics import people, props, vehicles
+from cosim.state import LABELS, RobotState, Street, Vehicles
+from physics import props, vehicles
 from physics.furniture import KINDS, parts_of
 from physics.gl.corners import Rows
+from physics.gl.crowd import Crowd
 from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
 from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
@@ -27,7 +28,6 @@ from physics.gl.surfaces import surfaces
 from physics.gl.tiles import TileBuffers, TileShaders, ground_parts, paint_parts
 from physics.gl.walls import WallBuffers, WallShaders
 from physics.ground import Ground
-from physics.mesh import Mesh
 from physics.robots import RobotModel
 from physics.tiles import Key, distance_to, keys_within, square
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
@@ -85,35 +85,39 @@ class Scene:
         self._anchor: Floats = np.zeros(2)
         self._fences = [self._fence(barrier) for barrier in barriers]
         self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
-        self._limbs = [
-            self._forms.id(("person", i), partial(_painted, part.mesh)) for i, part in enumerate(people.PARTS)
-        ]
+        self._crowd = Crowd(context, shadows)
 
     def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None, body: bool) -> None:
         """Hold everything that a picture can show. body: the robot itself is in the picture, not its shadow alone."""
         view, self._anchor = shot.view, anchor
         self._stream(view)
-        time_s = Clock().time_s(street.tick)
+        self._show_people(shot, street)
         placed = [
             *self._things(view),
             *self._fences_now(),
             self._lamps(street),
-            self._people(view.rows(street.people.xy, PERSON_MARGIN_M), street.people, time_s),
             self._vehicles(view.rows(street.vehicles.xy, VEHICLE_MARGIN_M), street.vehicles),
         ]
         myself = self._robot(robot) if robot is not None else _NOTHING
         _set(self._seen, [*placed, myself] if body else placed)
         if self._shadows:
-            self._cast(middle_of(view.eye_m), street, time_s, myself)
+            self._cast(middle_of(view.eye_m), street, myself)
 
-    def _cast(self, middle: Floats, street: Street, time_s: float, robot: Placed) -> None:
+    def _show_people(self, shot: Shot, street: Street) -> None:
+        """Those who can be in the picture, and those whose shadows can."""
+        xy = street.people.xy
+        seen = np.zeros(len(xy), dtype=bool)
+        seen[shot.view.rows(xy, PERSON_MARGIN_M)] = True
+        casts = np.abs(xy - middle_of(shot.eye_m)).max(axis=1, initial=0.0) < REACH_M
+        rows = np.flatnonzero(seen | casts if self._shadows else seen)
+        who = street.people.only(rows)
+        z = self._ground.heights(who.xy)
+        self._crowd.set(who, Clock().time_s(street.tick), z, shot, self._anchor, seen[rows], casts[rows])
+
+    def _cast(self, middle: Floats, street: Street, robot: Placed) -> None:
         """What throws shadows in the square around its middle, seen or not."""
-        people, cars = (
-            np.flatnonzero(np.abs(xy - middle).max(axis=1, initial=0.0) < REACH_M)
-            for xy in (street.people.xy, street.vehicles.xy)
-        )
-        movers = [self._people(people, street.people, time_s), self._vehicles(cars, street.vehicles), robot]
-        _set(self._movers, movers)
+        cars = np.flatnonzero(np.abs(street.vehicles.xy - middle).max(axis=1, initial=0.0) < REACH_M)
+        _set(self._movers, [self._vehicles(cars, street.vehicles), robot])
         still = (*middle.tolist(), *self._anchor.tolist())
         if still != self._still_for:
             keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
@@ -124,6 +128,7 @@ class Scene:
 
     def draw(self, stage: Stage) -> None:
         """Draw what was arranged: the small and near first, then the ground from near to far."""
+        self._crowd.draw(stage)
         for things in (self._seen, self._standing, self._movers):
             things.draw(stage)
         if stage == "colour":
@@ -145,6 +150,7 @@ class Scene:
         self._tiles.clear()
         for things in (self._seen, self._standing, self._movers):
             things.release()
+        self._crowd.release()
         self._forms.release()
 
     def _stream(self, view: View) -> None:
@@ -235,24 +241,6 @@ class Scene:
             return _NOTHING
         return np.array(forms), instances(at, heading, paint, LABELS["signal"])
 
-    def _people(self, rows: NDArray[np.intp], who: People, time_s: float) -> Placed:
-        if len(rows) == 0:
-            return _NOTHING
-        who = People(
-            tuple(who.ids[i] for i in rows), who.xy[rows], who.heading[rows], who.speed[rows],
-            tuple(who.doing[i] for i in rows),
-        )  # fmt: skip
-        about_y, about_z = people.swings(who, time_s)
-        joints = np.array([part.joint_m for part in people.PARTS])
-        cos, sin = np.cos(who.heading)[:, None], np.sin(who.heading)[:, None]
-        foot = np.column_stack([who.xy - self._anchor, self._ground.heights(who.xy)])[:, None]
-        turned = np.stack([cos * joints[:, 0] - sin * joints[:, 1], sin * joints[:, 0] + cos * joints[:, 1]], axis=2)
-        at = foot + np.concatenate([turned, np.broadcast_to(joints[:, 2:], (*turned.shape[:2], 1))], axis=2)
-        paint = np.array([[colours[part.coat] for part in people.PARTS] for colours in map(people.colours, who.ids)])
-        heading = (who.heading[:, None] + about_z).ravel()
-        placed = instances(at.reshape(-1, 3), heading, paint.reshape(-1, 3), LABELS["person"], about_y.ravel())
-        return np.tile(np.array(self._limbs), len(who)), placed
-
     def _vehicles(self, rows: NDArray[np.intp], which: Vehicles) -> Placed:
         if len(rows) == 0:
             return _NOTHING
@@ -275,10 +263,6 @@ class Scene:
         rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
         rows["turn"] = _quaternion(roll, pitch, robot.pose.heading_rad)
         return np.array([form]), rows
-
-
-def _painted(mesh: Mesh) -> list[Coat]:
-    return [Coat(mesh)]
 
 
 def _lamp(walk: bool) -> list[Coat]:

@@ -1,0 +1,316 @@
+"""People for the gl camera: skinned bodies, posed on the graphics card.
+
+Per picture a few numbers per person go up: four baked frames with weights, place, heading, size. A first small pass
+blends the frames and writes everybody's 24 joint matrices, in metres from the anchor, into a texture; the vertex
+shaders of all passes skin with them. Bodies of all outfits and levels lie in one buffer; a pass is one indirect draw
+for those near (four joints per vertex) and one for those far away (two).
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.geometry import Floats
+from cosim.state import LABELS, People
+from physics.gl.shading import Stage, programs
+from physics.people.body import COATS, Body, body
+from physics.people.clips import Clips, own_clips
+from physics.people.figure import LEVELS
+from physics.people.looks import ALL, look
+from physics.people.poses import poses
+from physics.view import Shot
+
+LEVEL_PX: Final = (170.0, 60.0, 26.0)
+"""Drawn height of a body, in pixels, below which the next coarser level is taken."""
+
+CORNER: Final = np.dtype(
+    [("at", "f4", 3), ("normal", "u1", 4), ("joints", "u1", 4), ("weights", "u1", 4), ("coat", "u1", 4)]
+)
+"""normal: as in corners.CORNER, its fourth how far fat stands out; weights: of 255; coat: row of COATS, three spare."""
+
+_NEAR_LEVELS: Final = 2
+_ROW: Final = 3 * 24
+_CROWD_MIN: Final = 64
+
+_POSE_VERTEX: Final = """#version 430
+void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
+"""
+
+_POSE_FRAGMENT: Final = """#version 430
+layout(binding = 0) uniform sampler2D baked;
+layout(binding = 1) uniform sampler2D told;
+out vec4 row;
+vec4 blended(int column, vec4 frames, vec4 weights) {
+    vec4 sum = vec4(0.0);
+    for (int k = 0; k < 4; k++)
+        if (weights[k] > 0.0) sum += weights[k] * texelFetch(baked, ivec2(column, int(frames[k])), 0);
+    return sum;
+}
+void main() {
+    int column = int(gl_FragCoord.x), person = int(gl_FragCoord.y), axis = column % 3;
+    vec4 frames = texelFetch(told, ivec2(0, person), 0), weights = texelFetch(told, ivec2(1, person), 0);
+    vec4 place = texelFetch(told, ivec2(2, person), 0), turn = texelFetch(told, ivec2(3, person), 0);
+    vec4 own = blended(column, frames, weights);
+    if (axis < 2) {
+        vec4 other = blended(column + (axis == 0 ? 1 : -1), frames, weights);
+        own = turn.x * own + (axis == 0 ? -turn.y : turn.y) * other;
+    }
+    row = own * place.w;
+    row.w += place[axis];
+}
+"""
+
+_VERTEX: Final = """
+layout(binding = 0) uniform sampler2D posed;
+layout(binding = 1) uniform sampler2D dyed;
+in vec3 in_at; in vec4 in_normal; in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
+in int person; in float girth;
+out vec3 at; out vec3 normal; flat out vec3 albedo;
+void main() {
+    vec3 outward = in_normal.xyz * (255.0 / 127.0) - 1.0;
+    vec4 here = vec4(in_at + outward * (in_normal.w * girth), 1.0);
+    vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
+    for (int k = 0; k < BONES; k++) {
+        int column = 3 * int(in_joints[k]);
+        x += in_weights[k] * texelFetch(posed, ivec2(column, person), 0);
+        y += in_weights[k] * texelFetch(posed, ivec2(column + 1, person), 0);
+        z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
+    }
+#if BONES < 4
+    float share = 1.0 / (in_weights.x + in_weights.y);
+    x *= share; y *= share; z *= share;
+#endif
+    at = vec3(dot(x, here), dot(y, here), dot(z, here));
+    normal = vec3(dot(x.xyz, outward), dot(y.xyz, outward), dot(z.xyz, outward));
+    albedo = texelFetch(dyed, ivec2(int(in_coat.x), person), 0).rgb;
+    gl_Position = project(at);
+}
+"""
+
+_FRAGMENT: Final = f"""
+in vec3 at; in vec3 normal; flat in vec3 albedo;
+void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
+"""
+
+
+class _Bodies:
+    """Bodies of all outfits at all levels in one vertex and one index buffer; they are made when first needed."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._rows: list[NDArray[np.void]] = []
+        self._indices: list[NDArray[np.uint32]] = []
+        self._starts: dict[tuple[int, int], tuple[int, int, int]] = {}
+        self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
+        self.version = 0
+
+    def start(self, outfit: int, level: int) -> tuple[int, int, int]:
+        """Count of indices, first index, first vertex."""
+        key = outfit, level
+        if key not in self._starts:
+            made = body(ALL[outfit], level)
+            first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
+            self._rows.append(corners(made))
+            self._indices.append(made.triangles.ravel().astype(np.uint32))
+            self._starts[key] = len(self._indices[-1]), first, base
+            self.release()
+            self.version += 1
+        return self._starts[key]
+
+    def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+        if self._buffers is None:
+            rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
+            self._buffers = self._context.buffer(rows.tobytes()), self._context.buffer(indices.tobytes())
+        return self._buffers
+
+    def release(self) -> None:
+        for buffer in self._buffers or ():
+            buffer.release()
+        self._buffers = None
+
+
+def corners(made: Body) -> NDArray[np.void]:
+    """(V,) rows of CORNER."""
+    rows = np.zeros(len(made.vertices), dtype=CORNER)
+    rows["at"] = made.vertices
+    rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
+    rows["normal"][:, 3] = np.rint(255.0 * made.fat)
+    rows["joints"], rows["coat"][:, 0] = made.joints, made.coat
+    rows["weights"] = np.rint(255.0 * made.weights)
+    rows["weights"][:, 0] += (255 - rows["weights"].sum(axis=1, dtype=np.int64)).astype(np.uint8)
+    return rows
+
+
+class _Arrays(NamedTuple):
+    """The bodies as a pair of programs reads them."""
+
+    colour: moderngl.VertexArray
+    shadow: moderngl.VertexArray
+
+
+class Crowd:
+    """The people of a picture. shadows: whether they are shaded by shadow maps."""
+
+    def __init__(self, context: moderngl.Context, shadows: bool, clips: Clips | None = None) -> None:
+        self._context = context
+        self._clips = own_clips() if clips is None else clips
+        matrices = self._clips.matrices
+        self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
+        self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
+        self._everywhere = context.vertex_array(self._pose, [])
+        self._programs = [programs(context, f"#define BONES {k}\n" + _VERTEX, _FRAGMENT, shadows) for k in (4, 2)]
+        self._bodies = _Bodies(context)
+        self._bound = -1
+        self._arrays: list[_Arrays] = []
+        self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
+        self._split = (0, 0, 0)
+        self._room = 0
+        self._grow(_CROWD_MIN)
+
+    def set(
+        self,
+        people: People,
+        time_s: float,
+        z_m: Floats,
+        shot: Shot,
+        anchor: Floats,
+        seen: NDArray[np.bool_],
+        casts: NDArray[np.bool_],
+    ) -> None:
+        """Hold these people, standing at heights (N,) z_m, as this picture will show them; binds a framebuffer.
+
+        seen: (N,) who can be in the picture; casts: (N,) whose shadow can.
+        """
+        count = len(people)
+        self._split = (0, 0, 0)
+        if not count:
+            return
+        if count > self._room:
+            self._grow(2 * count)
+        posed = poses(people, time_s, self._clips)
+        told = np.zeros((count, 4, 4), dtype=np.float32)
+        told[:, 0], told[:, 1] = posed.rows, posed.weights
+        told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = people.xy - anchor, z_m, posed.scale
+        told[:, 3, 0], told[:, 3, 1] = np.cos(people.heading), np.sin(people.heading)
+        looks = [look(name) for name in people.ids]
+        self._told.write(told.tobytes(), viewport=(0, 0, 4, count))
+        self._dyed.write(np.stack([who.colours for who in looks]).tobytes(), viewport=(0, 0, len(COATS), count))
+        level = np.where(seen, levels(people.xy, z_m, shot), -1)
+        girth = np.array([who.girth_m for who in looks], dtype=np.float32)
+        self._set_draws(np.array([who.outfit for who in looks]), level, casts, girth)
+        self._posed.use()
+        self._posed.viewport = (0, 0, _ROW, count)
+        self._context.enable_only(moderngl.NOTHING)
+        self._baked.use(0)
+        self._told.use(1)
+        self._everywhere.render(moderngl.TRIANGLES, vertices=3)
+
+    def draw(self, stage: Stage) -> None:
+        """Draw what was set; in the shadow maps of what moves everybody has few triangles."""
+        near, far, shadow = self._split
+        if stage == "still" or near + far + shadow == 0:
+            return
+        if self._bound != self._bodies.version:
+            self._bind()
+        self._matrices.use(0)
+        self._dyed.use(1)
+        if stage == "moving":
+            if not shadow:
+                return
+            self._arrays[1].shadow.render_indirect(self._commands, moderngl.TRIANGLES, count=shadow, first=near + far)
+            return
+        if near:
+            self._arrays[0].colour.render_indirect(self._commands, moderngl.TRIANGLES, count=near)
+        if far:
+            self._arrays[1].colour.render_indirect(self._commands, moderngl.TRIANGLES, count=far, first=near)
+
+    def release(self) -> None:
+        self._bodies.release()
+        self._release_room()
+        for thing in (self._baked, self._everywhere, self._pose):
+            thing.release()
+
+    def _set_draws(
+        self, outfit: NDArray[np.intp], level: NDArray[np.intp], casts: NDArray[np.bool_], girth: NDArray[np.float32]
+    ) -> None:
+        """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows. A level of -1 is
+        not in the picture."""
+        coarsest = np.full(len(outfit), LEVELS - 1)
+        rows, commands, split = [], [], []
+        at = 0
+        near = (level >= 0) & (level < _NEAR_LEVELS)
+        for kind, chosen in ((level, near), (level, level >= _NEAR_LEVELS), (coarsest, casts)):
+            who = np.flatnonzero(chosen)
+            key = kind[who] * len(ALL) + outfit[who]
+            order = np.argsort(key, kind="stable")
+            who, key = who[order], key[order]
+            first = np.flatnonzero(np.diff(key, prepend=-1))
+            lengths = np.diff(first, append=len(who))
+            for k, many in zip(first.tolist(), lengths.tolist(), strict=True):
+                indices, index, vertex = self._bodies.start(int(outfit[who[k]]), int(kind[who[k]]))
+                commands.append((indices, many, index, vertex, at + k))
+            rows.append(who)
+            split.append(len(first))
+            at += len(who)
+        self._split = (split[0], split[1], split[2])
+        if not commands:
+            return
+        people = np.concatenate(rows)
+        table = np.zeros(len(people), dtype=[("person", "i4"), ("girth", "f4")])
+        table["person"], table["girth"] = people, girth[people]
+        self._instances.write(table.tobytes())
+        self._commands.write(np.array(commands, dtype=np.uint32).tobytes())
+
+    def _grow(self, room: int) -> None:
+        """Make room for more people."""
+        self._release_room()
+        self._room, self._bound = room, -1
+        self._told = _texture(self._context, (4, room), 4, "f4")
+        self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
+        self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
+        self._posed = self._context.framebuffer([self._matrices])
+        self._instances = self._context.buffer(reserve=2 * room * 8)
+        self._commands = self._context.buffer(reserve=2 * room * 20)
+        self._held = [self._posed, self._told, self._dyed, self._matrices, self._instances, self._commands]
+
+    def _release_room(self) -> None:
+        for array in self._arrays:
+            array.colour.release()
+            array.shadow.release()
+        for thing in self._held:
+            thing.release()
+        self._arrays, self._held = [], []
+
+    def _bind(self) -> None:
+        vertices, indices = self._bodies.buffers()
+        layout = ("3f4 4f1 4u1 4f1 4u1", "in_at", "in_normal", "in_joints", "in_weights", "in_coat")
+        content = [(vertices, *layout), (self._instances, "1i4 1f4/i", "person", "girth")]
+
+        def array(program: moderngl.Program) -> moderngl.VertexArray:
+            return self._context.vertex_array(program, content, indices, skip_errors=True)
+
+        for old in self._arrays:
+            old.colour.release()
+            old.shadow.release()
+        self._arrays = [_Arrays(array(both.colour), array(both.shadow)) for both in self._programs]
+        self._bound = self._bodies.version
+
+
+def levels(xy: Floats, z_m: Floats, shot: Shot) -> NDArray[np.intp]:
+    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are in the picture."""
+    eye = shot.eye_m
+    far_m = np.sqrt((xy[:, 0] - eye[0]) ** 2 + (xy[:, 1] - eye[1]) ** 2 + (z_m + 0.9 - eye[2]) ** 2)
+    tall_px = 1.75 / np.maximum(far_m, 0.1) * 0.5 * shot.size[1] / np.tan(0.5 * np.radians(shot.fov_deg))
+    return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -tall_px))
+
+
+def _texture(
+    context: moderngl.Context, size: tuple[int, int], channels: int, dtype: str, data: bytes | None = None
+) -> moderngl.Texture:
+    texture = context.texture(size, channels, data, dtype=dtype, alignment=1)
+    texture.filter = moderngl.NEAREST, moderngl.NEAREST
+    return texture

@@ -1,0 +1,133 @@
+"""Bodies: skinned meshes of people at several levels of detail, put together from lofts and fitted to a family."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.geometry import Floats
+from physics.people.arms import arms
+from physics.people.clips import bind_of
+from physics.people.families import Family, man_rest_m, skeleton
+from physics.people.figure import LEVELS, Build, Legs, Sleeve, legs, trunk
+from physics.people.head import about_head, neck_and_head
+from physics.people.lofts import Piece, lofted
+from physics.people.skeleton import Skeleton, model_pose
+from physics.people.wear import Carried, Hair, carried, hair, headgear
+
+COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
+"""What a vertex is painted as; a person has one colour for each."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outfit:
+    """What makes a body: family, build, clothes, hair, and what is carried."""
+
+    family: Family
+    build: Build
+    legs: Legs
+    sleeve: Sleeve
+    hair: Hair
+    cap: bool = False
+    carried: Carried = ""
+    bare: bool = False
+    loose_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """A skinned mesh. vertices, normals (V, 3) in the A pose, x ahead, z up, soles at 0; triangles (T, 3), front
+    counter-clockwise; joints (V, 4) uint8 rows and weights (V, 4) float32 that fall and sum to 1; coat (V,) uint8 rows
+    of COATS; fat (V,) float32, how much a vertex moves out on stouter people."""
+
+    vertices: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    joints: NDArray[np.uint8]
+    weights: NDArray[np.float32]
+    coat: NDArray[np.uint8]
+    fat: NDArray[np.float32]
+
+
+@lru_cache(maxsize=128)
+def body(outfit: Outfit, level: int) -> Body:
+    """The body at a level: 0 is full detail, LEVELS - 1 the coarsest."""
+    if not 0 <= level < LEVELS:
+        raise ValueError(f"levels go from 0 to {LEVELS - 1}: {level}")
+    surfaces = [(piece.coat, lofted(piece, level)) for piece in pieces(outfit) if piece.sides[level]]
+    starts = np.cumsum([0, *(len(s.vertices) for _, s in surfaces)])
+    vertices = np.concatenate([s.vertices for _, s in surfaces])
+    triangles = np.concatenate([s.triangles + k for (_, s), k in zip(surfaces, starts.tolist(), strict=False)])
+    weights = np.concatenate([s.weights for _, s in surfaces])
+    weights = _sided(vertices, weights)
+    vertices = _fitted(vertices, weights, skeleton(outfit.family))
+    joints, few = strongest(weights)
+    coat = np.repeat([COATS.index(coat) for coat, _ in surfaces], [len(s.vertices) for _, s in surfaces])
+    return Body(
+        vertices.astype(np.float32),
+        smooth_normals(vertices, triangles).astype(np.float32),
+        triangles.astype(np.int32),
+        joints,
+        few,
+        coat.astype(np.uint8),
+        np.concatenate([s.fat for _, s in surfaces]).astype(np.float32),
+    )
+
+
+def pieces(outfit: Outfit) -> list[Piece]:
+    """The closed surfaces of a body."""
+    build = outfit.build
+    parts = trunk(build, outfit.loose_m, outfit.legs)
+    if outfit.legs == "skirt":
+        parts = parts[:1]
+    parts += neck_and_head(build)
+    parts += legs(build, outfit.legs, outfit.bare, outfit.loose_m)
+    parts += arms(build, outfit.sleeve, outfit.loose_m)
+    parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
+    if outfit.cap:
+        parts += [about_head(piece, build.head) for piece in headgear()]
+    return parts + carried(outfit.carried, outfit.loose_m)
+
+
+def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """The four joints that move each of V vertices most, and their weights, which sum to 1."""
+    order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
+    few = np.take_along_axis(weights, order, axis=1)
+    return order.astype(np.uint8), (few / few.sum(axis=1, keepdims=True)).astype(np.float32)
+
+
+def smooth_normals(vertices: Floats, triangles: NDArray[np.int32]) -> Floats:
+    """(V, 3) unit normals: means of the triangles around, by area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    face = np.cross(b - a, c - a)
+    total = np.zeros_like(vertices)
+    for axis in range(3):
+        total[:, axis] = np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(vertices))
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+
+
+def _sided(vertices: Floats, weights: Floats) -> Floats:
+    """Weights in which what a loft gives to both hips or collars goes to those of the vertex's own side."""
+    out = weights.copy()
+    share = np.clip(0.5 + vertices[:, 1] / 0.10, 0.0, 1.0)
+    share = share * share * (3.0 - 2.0 * share)
+    for a, b in ((1, 2), (13, 14)):
+        both = np.minimum(weights[:, a], weights[:, b]) * 2.0
+        middle = both > 0.0
+        total = weights[:, a] + weights[:, b]
+        out[:, a] = np.where(middle, total * share, weights[:, a])
+        out[:, b] = np.where(middle, total * (1.0 - share), weights[:, b])
+    return out
+
+
+def _fitted(vertices: Floats, weights: Floats, family: Skeleton) -> Floats:
+    """Vertices of the man moved along with their joints to where a family has them, at the family's size."""
+    man = Skeleton(man_rest_m(), 1.75)
+    scale = family.height_m / man.height_m
+    _, ours = bind_of(Skeleton(family.rest_m / scale, man.height_m), model_pose())
+    _, his = bind_of(man, model_pose())
+    return (vertices + weights @ (ours - his)) * scale

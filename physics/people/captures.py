@@ -1,0 +1,87 @@
+"""Motion captures that ship with PyBullet, turned onto the SMPL joints.
+
+The files are those of DeepMimic's humanoid: a list of frames of 44 numbers: how long the frame lasts, the root's
+position and quaternion (w x y z), then chest, neck, right hip, right knee, right ankle, right shoulder, right elbow,
+and the same five of the left; knees and elbows are one angle about z, all others quaternions. Axes there: x ahead,
+y up, z right; at rest the arms hang.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from cosim.errors import EngineError
+from cosim.geometry import Floats
+from physics.people.skeleton import INDEX, model_pose, rodrigues
+
+_COLUMNS: Final = {
+    "pelvis": 4, "chest": 8, "neck": 12, "right_hip": 16, "right_knee": 20, "right_ankle": 21, "right_shoulder": 25,
+    "right_elbow": 29, "left_hip": 30, "left_knee": 34, "left_ankle": 35, "left_shoulder": 39, "left_elbow": 43,
+}  # fmt: skip
+_HINGES: Final = ("right_knee", "right_elbow", "left_knee", "left_elbow")
+
+
+@dataclass(frozen=True, slots=True)
+class Capture:
+    """A captured motion. turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3); axes of the body."""
+
+    frame_s: float
+    turns: Floats
+    pelvis_m: Floats
+
+
+def capture(name: str) -> Capture:
+    """The capture `humanoid3d_<name>` of pybullet_data. Raises EngineError naming file and fault."""
+    found = importlib.util.find_spec("pybullet_data")
+    if found is None or not found.submodule_search_locations:
+        raise EngineError("pybullet_data is missing, which comes with PyBullet: install pybullet again")
+    return read_capture(Path(found.submodule_search_locations[0]) / "data" / "motions" / f"humanoid3d_{name}.txt")
+
+
+def read_capture(path: Path) -> Capture:
+    """A capture from a file. Raises EngineError naming file and fault."""
+    try:
+        rows = np.array(json.loads(path.read_text())["Frames"], dtype=float)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise EngineError(f"{path}: not a motion capture: {error}") from error
+    if rows.ndim != 2 or rows.shape[1] != 44 or len(rows) < 4 or not np.isfinite(rows).all():
+        raise EngineError(f"{path}: not a motion capture: 'Frames' must be 4 or more rows of 44 numbers")
+    pelvis = rows[:, 1:4] @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
+    return Capture(float(rows[0, 0]), _turns(rows), pelvis)
+
+
+def _turns(rows: Floats) -> Floats:
+    """(F, 24, 3, 3) turns against the T pose: the chest's shared among three joints, the neck's among two."""
+    local = {name: _turn(rows, name) for name in _COLUMNS}
+    turns = np.tile(np.eye(3), (len(rows), 24, 1, 1))
+    for name in ("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle"):
+        turns[:, INDEX[name]] = rodrigues(local[name])
+    for name in ("spine1", "spine2", "spine3"):
+        turns[:, INDEX[name]] = rodrigues(local["chest"] / 3.0)
+    for name in ("neck", "head"):
+        turns[:, INDEX[name]] = rodrigues(local["neck"] / 2.0)
+    hanging = model_pose(0.5 * np.pi)
+    for side in ("left", "right"):
+        down = hanging[INDEX[f"{side}_shoulder"]]
+        turns[:, INDEX[f"{side}_shoulder"]] = rodrigues(local[f"{side}_shoulder"]) @ down
+        turns[:, INDEX[f"{side}_elbow"]] = down.T @ rodrigues(local[f"{side}_elbow"]) @ down
+    return turns
+
+
+def _turn(rows: Floats, name: str) -> Floats:
+    """(F, 3) axis-angle of a joint against its parent, in our axes, both at rest with hanging arms."""
+    at = _COLUMNS[name]
+    if name in _HINGES:
+        return np.column_stack([np.zeros(len(rows)), -rows[:, at], np.zeros(len(rows))])
+    w, x, y, z = (rows[:, at : at + 4] / np.linalg.norm(rows[:, at : at + 4], axis=1, keepdims=True)).T
+    vector = np.column_stack([x, -z, y]) * np.where(w < 0.0, -1.0, 1.0)[:, None]
+    sine = np.linalg.norm(vector, axis=1, keepdims=True)
+    return np.asarray(
+        vector * np.where(sine > 1e-9, 2.0 * np.arctan2(sine, np.abs(w)[:, None]) / np.maximum(sine, 1e-9), 2.0)
+    )

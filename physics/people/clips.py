@@ -1,0 +1,74 @@
+"""All motions of all families, baked: the joints' matrices of every frame in one array that a renderer can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.gait import PACES_MPS
+from cosim.geometry import Floats
+from physics.people.families import FAMILIES, Family, skeleton
+from physics.people.gaits import FRAMES as STRIDE_FRAMES
+from physics.people.gaits import gait
+from physics.people.gestures import FRAMES as LOOP_FRAMES
+from physics.people.gestures import GESTURES, LOOP_S, gesture
+from physics.people.skeleton import Skeleton, forward, model_pose, skinning
+
+STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType({"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34})
+"""How far the back is bent."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clips:
+    """Baked motions. matrices: (R, 24, 3, 4) float32, one row per frame, loops one after another.
+
+    They take a vertex, as modelled, to the posed body, in the body frame (x ahead, y left, z up, the ground at 0).
+    gaits: (families, paces) first rows of strides of `stride_frames` frames; gestures: name -> (families,) first rows
+    of loops of `loop_frames` frames and `loop_s` seconds.
+    """
+
+    matrices: NDArray[np.float32]
+    gaits: NDArray[np.intp]
+    gestures: Mapping[str, NDArray[np.intp]]
+    stride_frames: int = STRIDE_FRAMES
+    loop_frames: int = LOOP_FRAMES
+    loop_s: float = LOOP_S
+
+
+@lru_cache(maxsize=1)
+def own_clips() -> Clips:
+    """The motions of our own bodies."""
+    return baked([(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES])
+
+
+def baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
+    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
+    rows: list[NDArray[np.float32]] = []
+    walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
+    standing = {name: np.zeros(len(bodies), dtype=np.intp) for name in GESTURES}
+    at = 0
+    for k, (body, stoop_rad, modelled) in enumerate(bodies):
+        bind = bind_of(body, modelled)
+        for knot in range(len(PACES_MPS)):
+            walking[k, knot] = at
+            rows.append(skinning(*forward(*gait(knot, body, stoop_rad), body), bind))
+            at += len(rows[-1])
+        for name, first in standing.items():
+            first[k] = at
+            rows.append(skinning(*forward(*gesture(name, body, stoop_rad), body), bind))
+            at += len(rows[-1])
+    matrices = np.concatenate(rows)
+    matrices.flags.writeable = False
+    return Clips(matrices, walking, MappingProxyType(standing))
+
+
+def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:
+    """Rotations (24, 3, 3) and positions (24, 3) of the joints in the pose in which a body is modelled."""
+    rotation, position = forward(modelled[None], body.rest_m[:1], body)
+    return rotation[0], position[0]

@@ -1,0 +1,156 @@
+"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand, reading a phone.
+
+Each is a loop of `LOOP_S` seconds over the SMPL joints: feet on the ground, a body that breathes and shifts its weight.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from cosim.gait import REFERENCE_M
+from cosim.geometry import Floats
+from physics.people.limbs import about_y, about_z, set_arm, set_leg
+from physics.people.skeleton import INDEX, Skeleton, rodrigues
+
+FRAMES: Final = 64
+LOOP_S: Final = 8.0
+
+_PHASE: Final = 2.0 * np.pi * np.arange(FRAMES) / FRAMES
+
+
+def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
+    """The loop called `name`, one of GESTURES: turns (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3) metres."""
+    scale = skeleton.height_m / REFERENCE_M
+    bends = np.zeros((FRAMES, 24, 3))
+    breath = np.sin(2.0 * _PHASE)
+    shift = np.sin(_PHASE + 0.6)
+    _bend(bends, "pelvis", 0.025 * shift, 0.03, 0.03 * np.sin(_PHASE))
+    _bend(bends, "spine1", -0.03 * shift, -0.02 + 0.25 * stoop_rad, 0.0)
+    _bend(bends, "spine2", 0.0, 0.01 + 0.35 * stoop_rad, 0.0)
+    _bend(bends, "spine3", 0.0, 0.02 - 0.014 * breath + 0.4 * stoop_rad, 0.0)
+    _bend(bends, "neck", 0.0, 0.10 - 0.45 * stoop_rad, 0.0)
+    _bend(bends, "head", 0.0, -0.06 + 0.01 * breath - 0.35 * stoop_rad, 0.0)
+    for side, left in (("left", 1.0), ("right", -1.0)):
+        _bend(bends, f"{side}_collar", -0.03 * left + 0.012 * left * breath, 0.0, 0.0)
+    arms = GESTURES[name](bends)
+    turns = rodrigues(bends)
+    pelvis = np.column_stack([np.zeros(FRAMES), 0.014 * scale * shift, np.zeros(FRAMES)])
+    pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.012 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
+    for side, (upper, fore, fingers, thumb) in arms.items():
+        set_arm(turns, side, *(np.broadcast_to(v, (FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
+    _stand(turns, pelvis, skeleton, scale)
+    return turns, pelvis
+
+
+def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
+    """Set both feet flat on the ground, a little apart and turned out, the left one a little ahead."""
+    for side, left in (("left", 1.0), ("right", -1.0)):
+        ankle = skeleton.rest_m[INDEX[f"{side}_ankle"]]
+        place = np.array([ankle[0] + 0.02 * left * scale, left * 0.105 * scale, ankle[2]])
+        foot = about_z(np.full(FRAMES, left * np.deg2rad(9.0))) @ about_y(np.zeros(FRAMES))
+        set_leg(turns, pelvis, side, np.tile(place, (FRAMES, 1)), foot, np.zeros(FRAMES), skeleton)
+
+
+def _bend(bends: Floats, joint: str, x: Floats | float, y: Floats | float, z: Floats | float) -> None:
+    """Add axis-angle turns: x leans to the right, y forward, z turns to the left."""
+    for axis, angle in enumerate((x, y, z)):
+        bends[:, INDEX[joint], axis] += angle
+
+
+Arm = tuple[Floats, Floats, Floats, Floats]
+"""Directions of upper arm, forearm, fingers, thumb: (3,) or (FRAMES, 3), x ahead, y left, z up."""
+
+
+def _ways(*ways: tuple[float, float, float]) -> Arm:
+    upper, fore, fingers, thumb = (np.array(way) for way in ways)
+    return upper, fore, fingers, thumb
+
+
+def _hanging(left: float) -> Arm:
+    return _ways((-0.06, 0.16 * left, -1.0), (0.16, 0.07 * left, -1.0), (0.20, 0.0, -1.0), (1.0, -0.45 * left, 0.2))
+
+
+def _both() -> dict[str, Arm]:
+    return {"left": _hanging(1.0), "right": _hanging(-1.0)}
+
+
+def _standing(bends: Floats) -> dict[str, Arm]:
+    _bend(bends, "head", 0.0, 0.0, 0.12 * np.sin(_PHASE + 1.0))
+    return _both()
+
+
+def _looking(bends: Floats) -> dict[str, Arm]:
+    """Turns head and shoulders to one side, holds, turns to the other."""
+    way = np.tanh(2.2 * np.sin(_PHASE)) / np.tanh(2.2)
+    _bend(bends, "spine3", 0.0, 0.0, 0.20 * way)
+    _bend(bends, "neck", 0.0, 0.0, 0.45 * way)
+    _bend(bends, "head", 0.0, -0.04, 0.50 * way)
+    return _both()
+
+
+def _talking(bends: Floats) -> dict[str, Arm]:
+    """Speaks with both hands, the right one livelier, and nods."""
+    beat = 0.6 * np.sin(5.0 * _PHASE) + 0.4 * np.sin(8.0 * _PHASE + 1.0)
+    other = 0.6 * np.sin(4.0 * _PHASE + 2.0) + 0.4 * np.sin(7.0 * _PHASE)
+    _bend(bends, "head", 0.05 * other, 0.08 * np.sin(6.0 * _PHASE), 0.18 * np.sin(2.0 * _PHASE))
+    _bend(bends, "spine3", 0.0, 0.0, 0.06 * np.sin(_PHASE))
+    o = np.zeros(FRAMES)
+    arms: dict[str, Arm] = {}
+    for side, left, swing in (("left", 1.0, other), ("right", -1.0, beat)):
+        upper = np.column_stack([o + 0.30 + 0.08 * swing, left * (0.28 + 0.06 * swing), o - 1.0])
+        fore = np.column_stack([o + 1.0, left * (0.02 + 0.30 * swing), 0.10 + 0.45 * swing])
+        fingers = fore + np.column_stack([o, -0.25 * left * (1.0 + swing), 0.15 + 0.2 * swing])
+        arms[side] = (upper, fore, fingers, np.column_stack([o, o + 0.45 * left, o + 1.0]))
+    return arms
+
+
+def _queueing(bends: Floats) -> dict[str, Arm]:
+    """Waits with hands joined before the body, and looks down and along the queue."""
+    _bend(bends, "neck", 0.0, 0.12 + 0.05 * np.sin(_PHASE), 0.10 * np.sin(2.0 * _PHASE))
+    _bend(bends, "head", 0.0, 0.06, 0.25 * np.sin(_PHASE))
+    return {
+        "left": _ways((0.10, 0.22, -1.0), (0.62, -0.58, -0.62), (0.5, -0.75, -0.62), (0.5, 0.2, 0.85)),
+        "right": _ways((0.10, -0.22, -1.0), (0.70, 0.58, -0.55), (0.55, 0.75, -0.55), (0.5, -0.2, 0.85)),
+    }
+
+
+def _stopping(bends: Floats) -> dict[str, Arm]:
+    """The right arm straight out ahead at the height of the shoulder, palm to whoever comes, fingers up."""
+    push = 0.02 * np.sin(4.0 * _PHASE)
+    _bend(bends, "spine3", 0.0, -0.02, 0.16)
+    _bend(bends, "neck", 0.0, 0.02, -0.10)
+    _bend(bends, "right_collar", 0.0, 0.0, 0.18)
+    o = np.zeros(FRAMES)
+    upper = np.column_stack([o + 1.0, o - 0.27, o + 0.03 + push])
+    fore = np.column_stack([o + 1.0, o - 0.22, o + 0.08 + push])
+    return {
+        "left": _hanging(1.0),
+        "right": (upper, fore, np.array([-0.10, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])),
+    }
+
+
+def _phoning(bends: Floats) -> dict[str, Arm]:
+    """Holds a phone before the chest in the left hand and looks down at it."""
+    _bend(bends, "neck", 0.0, 0.30, 0.0)
+    _bend(bends, "head", 0.0, 0.28 + 0.02 * np.sin(3.0 * _PHASE), -0.06)
+    return {
+        "left": _ways((0.28, 0.06, -1.0), (0.85, -0.42, 0.42), (0.80, -0.35, 0.62), (0.25, 0.75, 0.45)),
+        "right": _hanging(-1.0),
+    }
+
+
+GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxyType(
+    {
+        "stand": _standing,
+        "look": _looking,
+        "talk": _talking,
+        "queue": _queueing,
+        "stop": _stopping,
+        "phone": _phoning,
+    }
+)
+"""What each turns of the body, and where it holds its arms."""

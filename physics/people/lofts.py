@@ -1,0 +1,169 @@
+"""Lofts: smooth closed surfaces through rings, as fine as one asks for, with weights of joints.
+
+A loft is given by a few key rings. Finer levels lay rings between them on smooth curves; coarser levels leave out the
+keys that matter least. A ring of few sides is drawn a little larger, so that on average over all directions it is as
+wide as the round ring: so levels of detail agree in their silhouettes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.geometry import Floats
+from physics.people.skeleton import INDEX
+
+Joints = Mapping[str, float]
+"""Weights of joints, by name; they sum to 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ring:
+    """A cross-section. at: its middle; ahead, side: half axes, metres, about which it runs from ahead to side; back:
+    half axis on the other side of `ahead`, as a share of it; square: 2 is an ellipse, more is nearer to a box."""
+
+    at: tuple[float, float, float]
+    ahead: tuple[float, float, float]
+    side: tuple[float, float, float]
+    joints: Joints
+    back: float = 1.0
+    square: float = 2.0
+    fat: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """One closed surface. rings: from one end to the other; coat: what it is painted as; sides: per level, 0 leaves
+    the piece out; rings_kept: per level, how many rings, more than there are keys or fewer."""
+
+    coat: str
+    rings: tuple[Ring, ...]
+    sides: tuple[int, ...]
+    rings_kept: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """A piece at one level. vertices (V, 3) m; triangles (T, 3), front counter-clockwise; weights (V, 24); fat (V,)."""
+
+    vertices: Floats
+    triangles: NDArray[np.int32]
+    weights: Floats
+    fat: Floats
+
+
+def lofted(piece: Piece, level: int) -> Surface:
+    """A piece at a level, closed by a fan at both ends."""
+    table = _table(piece.rings)
+    table = _chosen(table, piece.rings_kept[level])
+    sides = piece.sides[level]
+    angle = 2.0 * np.pi * (np.arange(sides) + 0.5 * (sides % 2 == 0)) / sides
+    grow = np.pi / (sides * np.sin(np.pi / sides))
+    rings = _points(table, angle, grow)
+    n, k = len(table), sides
+    ends = table[[0, -1], :3]
+    vertices = np.concatenate([rings.reshape(-1, 3), ends])
+    around, after = np.arange(k), (np.arange(k) + 1) % k
+    base = k * np.arange(n - 1)[:, None]
+    quads = np.stack(
+        [base + around, base + after, base + k + after, base + around, base + k + after, base + k + around]
+    )
+    sheet = np.moveaxis(quads, 0, -1).reshape(-1, 3)
+    low = np.stack([np.full(k, n * k), after, around], 1)
+    high = np.stack([np.full(k, n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
+    triangles = np.concatenate([sheet, low, high]).astype(np.int32)
+    if _volume(vertices, triangles) < 0.0:
+        triangles = triangles[:, ::-1].copy()
+    own = np.concatenate([np.repeat(table[:, 12:], k, axis=0), table[[0, -1], 12:]])
+    weights = np.maximum(own[:, :24], 0.0)
+    weights /= weights.sum(axis=1, keepdims=True)
+    return Surface(vertices, triangles, weights, own[:, 24])
+
+
+def ball(
+    coat: str, at: tuple[float, float, float], half: tuple[float, float, float], joints: Joints, sides: Sequence[int]
+) -> Piece:
+    """An ellipsoid with (x, y, z) half axes."""
+    rings = []
+    for share in (-0.97, -0.72, -0.28, 0.28, 0.72, 0.97):
+        wide = float(np.sqrt(1.0 - share * share))
+        place = (at[0], at[1], at[2] + half[2] * share)
+        rings.append(Ring(place, (half[0] * wide, 0.0, 0.0), (0.0, half[1] * wide, 0.0), joints))
+    return Piece(coat, tuple(rings), tuple(sides), tuple(min(max(s, 4), 6) if s > 5 else 4 for s in sides))
+
+
+_WIDTH: Final = 12 + 24 + 1
+
+
+def _table(rings: Sequence[Ring]) -> Floats:
+    """(K, 37): middle, ahead, side, back, square, spare, weights of 24 joints, fat."""
+    table = np.zeros((len(rings), _WIDTH))
+    for row, ring in zip(table, rings, strict=True):
+        row[:9] = (*ring.at, *ring.ahead, *ring.side)
+        row[9], row[10], row[36] = ring.back, ring.square, ring.fat
+        for name, weight in ring.joints.items():
+            row[12 + INDEX[name]] = weight
+    return table
+
+
+def _chosen(table: Floats, wanted: int) -> Floats:
+    """The keys, more rings on smooth curves between them, or those keys without which the shape changes most."""
+    if wanted > len(table):
+        return _between(table, wanted)
+    kept = list(range(len(table)))
+    while len(kept) > max(wanted, 2):
+        cost = [_loss(table, kept[i - 1], kept[i], kept[i + 1]) for i in range(1, len(kept) - 1)]
+        del kept[1 + int(np.argmin(cost))]
+    return table[kept]
+
+
+def _loss(table: Floats, before: int, middle: int, after: int) -> float:
+    """How much surface is displaced when the ring in the middle is left out."""
+    way = np.linalg.norm(np.diff(table[[before, middle, after], :3], axis=0), axis=1)
+    share = way[0] / max(way.sum(), 1e-9)
+    line = table[before, :9] * (1.0 - share) + table[after, :9] * share
+    return float(np.abs(line - table[middle, :9]).sum() * way.sum())
+
+
+def _between(table: Floats, wanted: int) -> Floats:
+    """`wanted` rings: the keys, and in the longest gaps points of a smooth curve through them."""
+    way = np.concatenate([[0.0], np.cumsum(_gaps(table))])
+    extra = np.zeros(len(table) - 1, dtype=int)
+    for _ in range(wanted - len(table)):
+        extra[int(np.argmax(np.diff(way) / (extra + 1)))] += 1
+    tangent = np.gradient(table, way, axis=0)
+    rows = []
+    for i, more in enumerate(extra.tolist()):
+        t = (np.arange(more + 1) / (more + 1))[:, None]
+        width = way[i + 1] - way[i]
+        low, high = table[i], table[i + 1]
+        inner = (1 + 2 * t) * (1 - t) ** 2 * low + t**2 * (3 - 2 * t) * high
+        inner += width * (t * (1 - t) ** 2 * tangent[i] - t**2 * (1 - t) * tangent[i + 1])
+        inner[:, 12:] = (1 - t) * low[12:] + t * high[12:]
+        rows.append(inner)
+    return np.concatenate([*rows, table[-1:]])
+
+
+def _gaps(table: Floats) -> Floats:
+    """(K-1,) distances between rings, in place and in size."""
+    step = np.diff(table[:, :9], axis=0)
+    return np.asarray(np.sqrt((step**2).sum(axis=1)) + 1e-6)
+
+
+def _points(table: Floats, angle: Floats, grow: float) -> Floats:
+    """(K, A, 3) points on the rings."""
+    cos, sin = np.cos(angle), np.sin(angle)
+    power = (2.0 / table[:, 10])[:, None]
+    x = np.sign(cos) * np.abs(cos) ** power * np.where(cos < 0.0, table[:, 9:10], 1.0)
+    y = np.sign(sin) * np.abs(sin) ** power
+    flat = x[..., None] * table[:, None, 3:6] + y[..., None] * table[:, None, 6:9]
+    return np.asarray(table[:, None, :3] + grow * flat)
+
+
+def _volume(vertices: Floats, triangles: NDArray[np.int32]) -> float:
+    a, b, c = (vertices[triangles[:, i]] for i in range(3))
+    return float(np.einsum("ij,ij->", a, np.cross(b, c)))

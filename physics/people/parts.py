@@ -1,0 +1,205 @@
+"""A person as thirteen rigid parts on the same joints in the same poses, for renderers that cannot skin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from cosim.geometry import Floats
+from cosim.state import People
+from physics.mesh import Mesh, box, frustum, join
+from physics.people.body import COATS
+from physics.people.clips import bind_of, own_clips
+from physics.people.families import Family, skeleton
+from physics.people.looks import ALL, family_of, look
+from physics.people.poses import poses
+from physics.people.skeleton import INDEX, JOINTS, model_pose
+
+Colour = tuple[float, float, float]
+
+PARTS: Final = (
+    ("spine2", "top"),
+    ("head", "skin"),
+    ("head", "hair"),
+    ("left_shoulder", "top"),
+    ("right_shoulder", "top"),
+    ("left_elbow", "top"),
+    ("right_elbow", "top"),
+    ("left_wrist", "skin"),
+    ("right_wrist", "skin"),
+    ("left_hip", "bottom"),
+    ("right_hip", "bottom"),
+    ("left_knee", "bottom"),
+    ("right_knee", "bottom"),
+)
+"""The joint that carries each part, and what it is painted as."""
+
+_CARRIERS: Final = [INDEX[joint] for joint, _ in PARTS]
+
+
+@dataclass(frozen=True, slots=True)
+class Placed:
+    """Where the parts of N people are. at_m: (N, 13, 3) metres; turn: (N, 13, 4) quaternions x, y, z, w."""
+
+    at_m: Floats
+    turn: Floats
+
+
+@lru_cache(maxsize=4)
+def part_meshes(family: Family) -> tuple[Mesh, ...]:
+    """The parts of a family, about their joints, turned as the body is modelled."""
+    body = skeleton(family)
+    _, at = bind_of(body, model_pose())
+    f = body.height_m / 1.75
+    joints = {name: at[k] for k, name in enumerate(JOINTS)}
+    base = _off(joints["neck"], 0.0, -0.03 * f)
+    hem, ribs = _off(joints["pelvis"], 0.0, -0.08 * f), _off(joints["spine3"], 0.0, -0.02 * f)
+    chest = join(
+        [
+            _tube(hem, _off(ribs, 0.0, 0.01 * f), (0.11 * f, 0.155 * f), (0.114 * f, 0.159 * f), 8),
+            _tube(ribs, _off(base, 0.0, -0.03 * f), (0.115 * f, 0.16 * f), (0.08 * f, 0.17 * f), 8),
+            _tube(_off(base, 0.0, -0.03 * f), _off(base, 0.0, 0.03 * f), (0.08 * f, 0.17 * f), (0.06 * f, 0.06 * f), 8),
+        ]
+    )
+    skull = _off(joints["head"], 0.0, 0.075 * f)
+    head = join(
+        [
+            _tube(
+                _off(joints["neck"], 0.01, -0.05 * f),
+                _off(joints["head"], 0.01, 0.0),
+                (0.05 * f, 0.05 * f),
+                (0.05 * f, 0.05 * f),
+                5,
+            ),
+            _tube(_off(skull, 0.02, -0.12 * f), skull, (0.06 * f, 0.05 * f), (0.095 * f, 0.075 * f), 7),
+            _tube(skull, _off(skull, 0.0, 0.09 * f), (0.095 * f, 0.075 * f), (0.05 * f, 0.045 * f), 7),
+        ]
+    )
+    crown = _off(skull, -0.03 * f, 0.0)
+    hair = join(
+        [
+            _tube(
+                _off(crown, 0.0, -0.06 * f),
+                _off(crown, 0.012 * f, 0.06 * f),
+                (0.08 * f, 0.080 * f),
+                (0.105 * f, 0.084 * f),
+                7,
+            ),
+            _tube(
+                _off(crown, 0.012 * f, 0.06 * f),
+                _off(crown, 0.0, 0.112 * f),
+                (0.105 * f, 0.084 * f),
+                (0.05 * f, 0.045 * f),
+                7,
+            ),
+        ]
+    )
+    meshes: dict[str, list[Mesh]] = {"spine2": [chest], "head": [head, hair]}
+    for side in ("left", "right"):
+        shoulder, elbow, wrist, hand = (joints[f"{side}_{part}"] for part in ("shoulder", "elbow", "wrist", "hand"))
+        hip, knee, ankle = (joints[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
+        meshes[f"{side}_shoulder"] = [_tube(elbow, shoulder, (0.045 * f, 0.045 * f), (0.058 * f, 0.055 * f), 5)]
+        palm = _tube(hand + 0.9 * (hand - wrist), wrist, (0.050 * f, 0.014 * f), (0.052 * f, 0.02 * f), 4)
+        meshes[f"{side}_wrist"] = [palm]
+        meshes[f"{side}_elbow"] = [_tube(wrist, elbow, (0.028 * f, 0.028 * f), (0.042 * f, 0.042 * f), 5)]
+        meshes[f"{side}_hip"] = [_tube(knee, _off(hip, 0.0, 0.03 * f), (0.06 * f, 0.06 * f), (0.095 * f, 0.085 * f), 6)]
+        shoe = box((0.275 * f, 0.09 * f, 0.075 * f), (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f), skip=("bottom",))
+        meshes[f"{side}_knee"] = [join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe])]
+    taken = {name: iter(list_) for name, list_ in meshes.items()}
+    return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in PARTS)
+
+
+def placed(people: People, z_m: Floats, time_s: float) -> Placed:
+    """The parts of N people who stand at heights (N,) z_m, in their poses at `time_s`."""
+    clips = own_clips()
+    posed = poses(people, time_s, clips)
+    matrices = posed.matrices(clips)[:, _CARRIERS].astype(float)
+    rest = np.array([_joints(family_of(name)) for name in people.ids]).reshape(len(people), len(PARTS), 3)
+    turn = matrices[..., :3]
+    at = (np.einsum("npab,npb->npa", turn, rest) + matrices[..., 3]) * posed.scale[:, None, None]
+    cos, sin = np.cos(people.heading), np.sin(people.heading)
+    facing = np.zeros((len(people), 1, 3, 3))
+    facing[:, 0, 0, 0], facing[:, 0, 0, 1], facing[:, 0, 1, 0], facing[:, 0, 1, 1] = cos, -sin, sin, cos
+    facing[:, 0, 2, 2] = 1.0
+    ground = np.column_stack([people.xy, z_m])[:, None]
+    return Placed((facing @ at[..., None])[..., 0] + ground, _quaternions(facing @ turn))
+
+
+@lru_cache(maxsize=4)
+def _joints(family: Family) -> Floats:
+    """(13, 3) where the parts' joints are on the body as it is modelled."""
+    return bind_of(skeleton(family), model_pose())[1][_CARRIERS]
+
+
+@lru_cache(maxsize=4096)
+def part_colours(name: str) -> tuple[Colour, ...]:
+    """The colours of the parts of the person called `name`."""
+    who = look(name)
+    outfit = ALL[who.outfit]
+    red, green, blue = (who.colours / 255.0).T.tolist()
+    colours = dict(zip(COATS, zip(red, green, blue, strict=True), strict=True))
+    chosen = []
+    for joint, coat in PARTS:
+        if joint.endswith("knee") and outfit.bare:
+            coat = "skin"
+        if joint.endswith("elbow") and outfit.sleeve == "short":
+            coat = "skin"
+        if joint.endswith("hip") and outfit.legs == "coat":
+            coat = "top"
+        if coat == "hair" and outfit.cap:
+            coat = "cap"
+        chosen.append(colours[coat])
+    return tuple(chosen)
+
+
+def _quaternions(turns: Floats) -> Floats:
+    """(..., 4) quaternions x, y, z, w of (..., 3, 3) matrices that are nearly rotations."""
+    x = turns[..., 0] / np.linalg.norm(turns[..., 0], axis=-1, keepdims=True)
+    z = np.cross(x, turns[..., 1])
+    z /= np.linalg.norm(z, axis=-1, keepdims=True)
+    y = np.cross(z, x)
+    w2 = np.stack(
+        [
+            1.0 + x[..., 0] - y[..., 1] - z[..., 2],
+            1.0 - x[..., 0] + y[..., 1] - z[..., 2],
+            1.0 - x[..., 0] - y[..., 1] + z[..., 2],
+            1.0 + x[..., 0] + y[..., 1] + z[..., 2],
+        ],
+        axis=-1,
+    )
+    size = np.sqrt(np.maximum(w2, 0.0))
+    xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
+    wx, wy, wz = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
+    largest = np.argmax(w2, axis=-1)
+    rows = np.stack(
+        [
+            np.stack([w2[..., 0], xy, xz, wx], -1),
+            np.stack([xy, w2[..., 1], yz, wy], -1),
+            np.stack([xz, yz, w2[..., 2], wz], -1),
+            np.stack([wx, wy, wz, w2[..., 3]], -1),
+        ],
+        axis=-2,
+    )
+    row = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
+    return np.asarray(row / (2.0 * np.take_along_axis(size, largest[..., None], axis=-1)))
+
+
+def _off(point: Floats, ahead_m: float, up_m: float) -> Floats:
+    return np.asarray(point + np.array([ahead_m, 0.0, up_m]))
+
+
+def _tube(
+    low: Floats, high: Floats, low_radius: tuple[float, float], high_radius: tuple[float, float], sides: int
+) -> Mesh:
+    """A tapered prism from one point to another; half axes ahead and across."""
+    way = high - low
+    length = float(np.linalg.norm(way))
+    upright = frustum(low_radius, high_radius, 0.0, length, sides)
+    z = way / length
+    y = np.cross(z, (1.0, 0.0, 0.0))
+    y /= np.linalg.norm(y)
+    turn = np.column_stack([np.cross(y, z), y, z])
+    return Mesh(upright.vertices @ turn.T + low, upright.normals @ turn.T, upright.triangles)

@@ -1,0 +1,109 @@
+"""The pose of everybody in a snapshot: a few numbers per person that say which baked frames to blend."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.gait import PACES_MPS, first_stride, relative_pace, stature_m
+from cosim.geometry import Floats
+from cosim.state import People
+from physics.people.clips import Clips, own_clips
+from physics.people.families import FAMILIES, Family
+from physics.people.looks import family_of
+
+_PACES: Final = np.array(PACES_MPS)
+_STANDING_MPS: Final = (0.04, PACES_MPS[0])
+"""Between these paces a gesture turns into the slowest walk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Poses:
+    """Poses of N people. rows: (N, 4) frames in the baked array; weights: (N, 4) float32 that sum to 1; scale: (N,)
+    factor on the body's size."""
+
+    rows: NDArray[np.intp]
+    weights: NDArray[np.float32]
+    scale: Floats
+
+    def matrices(self, clips: Clips) -> NDArray[np.float32]:
+        """(N, 24, 3, 4) matrices of the joints, blended as a renderer blends them; the scale is not in them."""
+        frames = clips.matrices.reshape(len(clips.matrices), -1)[self.rows]
+        blend = np.matmul(self.weights[:, None, :], frames)
+        return np.asarray(blend.reshape(len(self.rows), 24, 3, 4))
+
+
+def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
+    """How everybody stands or walks at `time_s`: a function of the snapshot alone.
+
+    Who walks is drawn between the two strides of the paces around theirs, at the phase of the strides they took; who
+    stands does what `people.doing` says; in between, as one starts or stops, the one turns into the other.
+    """
+    clips = own_clips() if clips is None else clips
+    if not len(people):
+        return Poses(np.zeros((0, 4), np.intp), np.zeros((0, 4), np.float32), np.zeros(0))
+    family, stature, size, offset = _facts_of(people.ids)
+    pace = relative_pace(people.pace, stature)
+    knot = np.clip(np.searchsorted(_PACES, pace, side="right") - 1, 0, len(_PACES) - 2)
+    faster = np.clip((pace - _PACES[knot]) / (_PACES[knot + 1] - _PACES[knot]), 0.0, 1.0)
+    slow = np.flatnonzero(pace < _PACES[0])
+
+    frame, frames = people.strides % 1.0 * clips.stride_frames, clips.stride_frames
+    low = np.minimum(frame.astype(np.intp), frames - 1)
+    late = frame - low
+    first, second = clips.gaits[family, knot], clips.gaits[family, knot + 1]
+    after = (low + 1) % frames
+    rows = np.stack([first + low, first + after, second + low, second + after], axis=1)
+    weights = np.stack([1.0 - late, late, 1.0 - late, late], axis=1)
+    weights[:, :2] *= (1.0 - faster)[:, None]
+    weights[:, 2:] *= faster[:, None]
+    if len(slow):
+        _standing(people, time_s, clips, slow, family, pace, offset, rows, weights)
+    return Poses(rows, weights.astype(np.float32), size)
+
+
+def _standing(
+    people: People,
+    time_s: float,
+    clips: Clips,
+    slow: NDArray[np.intp],
+    family: NDArray[np.intp],
+    pace: Floats,
+    offset: Floats,
+    rows: NDArray[np.intp],
+    weights: Floats,
+) -> None:
+    """Let those in (M,) rows `slow` do what they do on the spot: the second half of their frames is a gesture."""
+    start, end = _STANDING_MPS
+    share = np.clip((pace[slow] - start) / (end - start), 0.0, 1.0)
+    walk = share * share * (3.0 - 2.0 * share)
+    frame = (time_s / clips.loop_s + offset[slow]) % 1.0 * clips.loop_frames
+    low = np.minimum(frame.astype(np.intp), clips.loop_frames - 1)
+    late = frame - low
+    doing = [people.doing[i] for i in slow.tolist()]
+    names = [clips.gestures["stand" if what == "walk" else what] for what in doing]
+    first = np.array([row[k] for row, k in zip(names, family[slow].tolist(), strict=True)])
+    rows[slow, 2], rows[slow, 3] = first + low, first + (low + 1) % clips.loop_frames
+    weights[slow, :2] *= walk[:, None]
+    weights[slow, 2], weights[slow, 3] = (1.0 - walk) * (1.0 - late), (1.0 - walk) * late
+
+
+@lru_cache(maxsize=32)
+def _facts_of(names: tuple[str, ...]) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    facts = np.array([_facts(name) for name in names])
+    return facts[:, 0].astype(np.intp), facts[:, 1], facts[:, 2], facts[:, 3]
+
+
+@lru_cache(maxsize=65536)
+def _facts(name: str) -> tuple[float, float, float, float]:
+    """Row of the family, stature m, factor on the family's body, where in a loop the person is at time 0."""
+    family: Family = family_of(name)
+    stature = stature_m(name)
+    return float(FAMILIES.index(family)), stature, stature / _STATURES[family], first_stride(name)
+
+
+_STATURES: Final[dict[Family, float]] = {"man": 1.75, "woman": 1.64, "child": 1.25, "elder": 1.66}

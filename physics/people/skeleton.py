@@ -1,0 +1,111 @@
+"""The 24 joints of the SMPL layout, forward kinematics, and linear blend skinning.
+
+Source: Loper, Mahmood, Romero, Pons-Moll, Black: SMPL, a skinned multi-person linear model, ACM TOG 34(6), 2015,
+section 3. Ours are the axes: x ahead, y left, z up, metres, the soles at z = 0. The rest pose is a T: a joint that is
+not turned has the axes of the body.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cosim.geometry import Floats
+
+JOINTS: Final = (
+    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
+    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
+    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
+)  # fmt: skip
+"""Names in SMPL's order; a joint comes after its parent."""
+
+PARENTS: Final = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
+"""Row of each joint's parent; the pelvis has none."""
+
+INDEX: Final[Mapping[str, int]] = MappingProxyType({name: k for k, name in enumerate(JOINTS)})
+MIRRORED: Final = (0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22)
+"""Row of each joint's counterpart on the other side."""
+
+REACH_RAD: Final = np.deg2rad(74.0)
+"""How far the arms are let down from the T in the pose in which our bodies are modelled."""
+
+
+@dataclass(frozen=True, slots=True)
+class Skeleton:
+    """Where the joints are on a body at rest. rest_m: (24, 3); height_m: from sole to crown."""
+
+    rest_m: Floats
+    height_m: float
+
+    @property
+    def offsets_m(self) -> Floats:
+        """(24, 3) from each joint's parent to the joint; the pelvis from the ground below it."""
+        rest = self.rest_m
+        return np.concatenate([rest[:1], rest[1:] - rest[list(PARENTS[1:])]])
+
+
+def rodrigues(turns_rad: ArrayLike) -> Floats:
+    """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's axis-angle)."""
+    turns = np.asarray(turns_rad, dtype=float)
+    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
+    x, y, z = np.moveaxis(turns / np.maximum(angle[..., 0], 1e-12), -1, 0)
+    o = np.zeros_like(x)
+    cross = np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
+    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+
+
+def axis_angle(matrices: Floats) -> Floats:
+    """(..., 3) axis-angle vectors of (..., 3, 3) rotations of less than half a turn."""
+    skew = 0.5 * (matrices - np.swapaxes(matrices, -1, -2))
+    vector = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
+    cosine = 0.5 * (np.trace(matrices, axis1=-2, axis2=-1)[..., None] - 1.0)
+    angle = np.arctan2(sine, cosine)
+    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
+
+
+def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats, Floats]:
+    """Joints of posed bodies: (F, 24, 3, 3) rotations and (F, 24, 3) positions in the body frame.
+
+    turns: (F, 24, 3, 3) of each joint against its parent; pelvis_m: (F, 3). The product along the chain of parents
+    of [turn | offset], as the paper's world transformation of a joint.
+    """
+    offsets = skeleton.offsets_m
+    rotation, position = np.empty_like(turns), np.empty((*turns.shape[:2], 3))
+    rotation[:, 0], position[:, 0] = turns[:, 0], pelvis_m
+    for joint, parent in enumerate(PARENTS[1:], start=1):
+        rotation[:, joint] = rotation[:, parent] @ turns[:, joint]
+        position[:, joint] = position[:, parent] + rotation[:, parent] @ offsets[joint]
+    return rotation, position
+
+
+def model_pose(reach_rad: float = float(REACH_RAD)) -> Floats:
+    """(24, 3, 3) turns of the A pose in which our bodies are modelled: the T with the arms let down."""
+    turns = np.zeros((24, 3))
+    turns[INDEX["left_shoulder"], 0], turns[INDEX["right_shoulder"], 0] = -reach_rad, reach_rad
+    return rodrigues(turns)
+
+
+def skinning(rotation: Floats, position: Floats, bind: tuple[Floats, Floats]) -> NDArray[np.float32]:
+    """(F, 24, 3, 4) float32 matrices that take a vertex from the pose it was modelled in to the posed body.
+
+    bind: rotations (24, 3, 3) and positions (24, 3) of the joints in the modelled pose. The paper's G'(theta), which
+    removes the transformation of the rest pose.
+    """
+    turn = rotation @ np.swapaxes(bind[0], -1, -2)
+    shift = position - np.einsum("fjab,jb->fja", turn, bind[1])
+    return np.concatenate([turn, shift[..., None]], axis=-1).astype(np.float32)
+
+
+def skinned(vertices: Floats, joints: NDArray[Any], weights: Floats, matrices: NDArray[np.float32]) -> Floats:
+    """(V, 3) vertices of one posed body by linear blend skinning: each the weighted mean of what its joints make of it.
+
+    vertices (V, 3); joints (V, K) rows; weights (V, K) that sum to 1; matrices (24, 3, 4) as from `skinning`.
+    """
+    blend = np.einsum("vk,vkab->vab", weights, matrices[joints].astype(float))
+    return np.asarray(np.einsum("vab,vb->va", blend[..., :3], vertices) + blend[..., 3])
