@@ -33,7 +33,7 @@ def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool 
     def make(noise: Noise) -> Picture:
         chips = noise.grain(0.6)
         colour = (tone, tone, 1.02 * tone)
-        rgb = plain(noise, colour, 0.012, 0.0, 4)
+        rgb = plain(noise, colour, 0.010, 0.0, 8)
         light = step(0.9, 2.2, chips) - 0.8 * step(0.7, 2.0, -chips)
         rgb = rgb + np.float32(stone) * (light + 0.35 * noise.grain())[..., None]
         if patches:
@@ -43,7 +43,7 @@ def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool 
             rgb = shaded(mixed(rgb, fresh, step(0.0, 0.005, edge)), 1.0 - 0.22 * seam)
         if worn:
             split = cracks(noise, cells(noise, 4), 0.004)
-            rgb = shaded(rgb, 1.0 - 0.55 * np.float32(worn) * split)
+            rgb = shaded(rgb, 1.0 - 0.48 * np.float32(worn) * split)
             rgb = stained(rgb, noise, 0.10 * worn)
         return Picture(rgb)
 
@@ -176,10 +176,12 @@ def _paint(worn: float) -> Generator:
 def _cast(noise: Noise) -> Picture:
     """Cast concrete with a joint every 1.5 m."""
     bond = courses(noise.size, 3.0, 2, [1.5], [0.0])
-    whole = laid(noise, bond, 3.0, _GREY, (0.40, 0.39, 0.38), joint_m=0.012, spread=0.015, wobble_m=0.0, grain=0.016)
+    whole = laid(
+        noise, bond, 3.0, _GREY[:1], (0.40, 0.39, 0.38), joint_m=0.012, spread=0.015, wobble_m=0.0, grain=0.016
+    )
     pores = step(1.9, 2.6, noise.grain(0.5))
-    rgb = stained(shaded(whole.rgb, 1.0 - 0.16 * pores), noise, 0.10, 4)
-    return Picture(shaded(rgb, 1.0 - 0.45 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha)
+    rgb = stained(shaded(whole.rgb, 1.0 - 0.16 * pores), noise, 0.08)
+    return Picture(shaded(rgb, 1.0 - 0.32 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha)
 
 
 GROUND: Final[Mapping[str, Recipe]] = {

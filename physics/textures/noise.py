@@ -119,7 +119,7 @@ def _clouds(size: int, cells: int) -> Field:
         total += np.float32(share) * _resized(_grid(rng, n), size)
         share, n = 0.55 * share, 2 * n
     # Bent a little by other noise, so that the grid it was drawn on does not show.
-    bend = [np.float32(0.22 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
+    bend = [np.float32(0.10 * size / cells) * _resized(_grid(rng, cells), size) for _ in range(2)]
     total = remapped(total, bend[0], bend[1])
     return _locked((total - total.mean()) / total.std())
 

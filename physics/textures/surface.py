@@ -11,7 +11,7 @@ from physics.textures.layers import Colour, Picture, Rgb
 from physics.textures.noise import Cells, Field, Noise, blurred, step
 
 
-def plain(noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 4) -> Rgb:
+def plain(noise: Noise, colour: Colour, clouds: float = 0.02, grain: float = 0.03, cells: int = 8) -> Rgb:
     """One colour with large soft patches and fine grain, both given as deviations of sRGB."""
     tone = np.float32(clouds) * noise.clouds(cells) + np.float32(grain) * noise.grain()
     return np.asarray(
@@ -57,7 +57,7 @@ def laid(
     face = 1.0 - (1.0 - face) * np.float32(min(1.0, joint_m / width + 0.25))
     palette = np.asarray(colours, dtype=np.float32)[noise.rng.integers(len(colours), size=bond.n)]
     palette *= (1.0 + noise.rng.normal(0.0, spread, (bond.n, 1))).astype(np.float32)
-    tone = 1.0 + np.float32(clouds) * noise.clouds(4) + np.float32(grain) * noise.grain()
+    tone = 1.0 + np.float32(clouds) * noise.clouds(8) + np.float32(grain) * noise.grain()
     worn = step(0.0, 4.0 * soft + 0.004, edge - np.float32(0.5 * width))
     tone *= 0.90 + 0.10 * worn
     tone *= relief(blurred(face, 0.7), 0.10)
@@ -78,7 +78,7 @@ def cracks(noise: Noise, found: Cells, width: float, wiggle: float = 0.012) -> F
     return np.asarray(line * step(0.2, 0.9, noise.clouds(4)), dtype=np.float32)
 
 
-def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 4) -> Rgb:
+def stained(rgb: Rgb, noise: Noise, depth: float = 0.10, cells: int = 8) -> Rgb:
     """Darker where dirt has settled, in soft patches."""
     dirt = step(-0.4, 2.4, noise.clouds(cells))
     return np.asarray(rgb * (1.0 - np.float32(depth) * dirt[..., None]), dtype=np.float32)

@@ -228,7 +228,7 @@ def _glass(noise: Noise) -> Picture:
     """A curtain wall's panes of 1.5 m: sky above, the other side of the street below."""
     at = (np.arange(noise.size, dtype=np.float32) + 0.5) / noise.size * 2.0 % 1.0
     x, y = np.meshgrid(at, at)
-    sky = step(0.15, 0.85, 1.0 - y + 0.10 * noise.clouds(4))
+    sky = step(0.15, 0.85, 1.0 - y + 0.05 * noise.clouds(8))
     rgb = mixed((0.15, 0.19, 0.21), (0.44, 0.52, 0.57), sky)
     frame = step(0.02, 0.028, np.minimum(np.minimum(x, 1.0 - x), np.minimum(y, 1.0 - y)))
     finish = np.stack([frame, np.zeros_like(frame)], axis=-1)
