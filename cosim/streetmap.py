@@ -108,7 +108,8 @@ class Feature:
     """A building or a thing on the street that the map itself shows.
 
     x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a lamp) or right (who
-    sits on a bench). height_m: 0 where the map does not say. polygon: a building's ground; empty for the others.
+    sits on a bench, the front of a building). height_m: 0 where the map does not say. polygon: a building's ground;
+    empty for the others.
     """
 
     kind: FeatureKind

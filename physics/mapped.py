@@ -5,6 +5,7 @@ Where it shows something, nothing of the kind is made up: see `shows`.
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections import defaultdict
 from collections.abc import Sequence
@@ -59,11 +60,8 @@ class MappedThings:
         found = []
         for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
             parts = shapely.get_parts(shapely.intersection(self._houses[i].polygon, tile))
-            solid = [part for part in parts if isinstance(part, Polygon) and part.area > _SPLINTER_M2]
-            found += [
-                _building(self._houses[i], part, f"building:map:{i}:{key[0]}:{key[1]}:{k}", self._floors_m[i])
-                for k, part in enumerate(solid)
-            ]
+            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
+            found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
@@ -91,17 +89,22 @@ def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
     return float(terrain.height(shapely.get_coordinates(shapely.segmentize(whole.exterior, 1.0))).mean())
 
 
-def _building(house: Feature, part: Polygon, name: str, floor_m: float) -> Building:
+def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
+    """A part of a mapped building, in the box around it along its street; all parts of one bear its name and look."""
     part = shapely.orient_polygons(part)
-    x0, y0, x1, y1 = part.bounds
-    drawn = zlib.crc32(f"{house.x_m:.2f},{house.y_m:.2f}".encode())
+    cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    corners = shapely.get_coordinates(part) @ turn
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y = (turn @ (0.5 * (low + high))).tolist()
+    length, deep = (high - low).tolist()
     return Building(
-        id=name,
-        x_m=0.5 * (x0 + x1),
-        y_m=0.5 * (y0 + y1),
-        heading_rad=0.0,
-        size_m=(x1 - x0, y1 - y0, house.height_m),
-        facade=drawn % len(FACADES),
+        id=f"building:map:{number}",
+        x_m=x,
+        y_m=y,
+        heading_rad=house.heading_rad,
+        size_m=(length, deep, house.height_m),
+        facade=zlib.crc32(f"{number}:{house.x_m:.2f}".encode()) % len(FACADES),
         outline=part,
         walls=_walls(part, house.polygon),
         floor_m=floor_m,

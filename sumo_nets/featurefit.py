@@ -101,12 +101,14 @@ class _Streets:
         """Where nothing may stand, around a point."""
         return self._closed.union(at, 2.0 * MOVED_M)
 
-    def heading(self, kind: str, at: Point) -> float:
-        """How a thing stands there: a lamp's arm over the road, a bench facing the walk, the rest along the street."""
+    def heading(self, kind: str, at: Point | Polygon) -> float:
+        """How a thing stands there: a lamp's arm over the road, a bench facing the walk, a building's front to the
+        street, the rest along it."""
         over_road = self._roads.toward(at)
         to_walk = self._walks.toward(at)
-        if kind == "bench" and to_walk is not None:
-            return math.remainder(to_walk + 0.5 * math.pi, 2.0 * math.pi)
+        faced = to_walk if kind == "bench" or over_road is None else over_road
+        if kind in ("bench", "building") and faced is not None:
+            return math.remainder(faced + 0.5 * math.pi, 2.0 * math.pi)
         toward = over_road if over_road is not None else to_walk
         return 0.0 if toward is None else math.remainder(toward - 0.5 * math.pi, 2.0 * math.pi)
 
@@ -130,14 +132,13 @@ class _Lines:
         self._lines: NDArray[np.object_] = np.array([shapely.LineString(p.line[:, :2]) for p in pieces], dtype=object)
         self._tree = shapely.STRtree(self._lines)
 
-    def toward(self, at: Point) -> float | None:
-        """Heading from a point to the nearest line within 30 m."""
+    def toward(self, at: Point | Polygon) -> float | None:
+        """Heading from a place to the nearest line within 30 m."""
         nearest = self._tree.query_nearest(at, max_distance=30.0, all_matches=False)
         if not len(nearest):
             return None
-        line = self._lines[nearest[0]]
-        foot = shapely.line_interpolate_point(line, shapely.line_locate_point(line, at))
-        return math.atan2(foot.y - at.y, foot.x - at.x)
+        (x0, y0), (x1, y1) = shapely.get_coordinates(shapely.shortest_line(at, self._lines[nearest[0]])).tolist()
+        return math.atan2(y1 - y0, x1 - x0)
 
 
 def _band(strip: Strip) -> shapely.Geometry:
@@ -166,13 +167,24 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
             parts = parts if left else []
         for part in parts:
             x, y = shapely.get_coordinates(shapely.point_on_surface(part))[0].tolist()
-            found.append(Feature("building", round(x, 2), round(y, 2), 0.0, round(thing.height_m, 2), part))
+            heading = round(_front(part, streets.heading("building", part)), 4)
+            found.append(Feature("building", round(x, 2), round(y, 2), heading, round(thing.height_m, 2), part))
     told = []
     if cut:
         told.append(f"{cut} buildings that reached into streets are cut back: what is walked on wins")
     if dropped:
         told.append(f"{dropped} buildings that lay mostly on streets are left out")
     return found, told
+
+
+def _front(part: Polygon, heading_rad: float) -> float:
+    """Heading along the wall that fronts the street best, for a street to the right of `heading_rad`."""
+    ring = shapely.get_coordinates(shapely.orient_polygons(part).exterior)
+    sides = np.diff(ring, axis=0)
+    # Walls run with the outside to their right: one that fronts the street runs along the heading.
+    fit = sides @ np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    x, y = sides[int(np.argmax(fit * (fit > 0.7 * np.hypot(*sides.T))))].tolist()
+    return math.atan2(y, x)
 
 
 def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:

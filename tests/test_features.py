@@ -165,6 +165,8 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     assert min(shapely.distance(f.polygon, streets) for f in buildings) > WALL_M - 0.03
     assert sorted(round(f.height_m, 2) for f in buildings) == [12.8, 15.24]
     assert sum(len(f.polygon.interiors) for f in buildings) == 1
+    assert {round(math.sin(f.heading_rad)) for f in buildings} == {0}
+    assert {(f.y_m > road_axis(street_map)) == (math.cos(f.heading_rad) > 0.9) for f in buildings} == {True}
     props = [p for p in standing(street_map, 1) if p.id.startswith("prop:map")]
     assert Counter(p.kind for p in props) == {"tree": 3, "lamp": 1, "bench": 1, "bollard": 1}
     roads = shapely.union_all(lanes)
@@ -216,6 +218,7 @@ def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
     parts = [b for key in keys_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
     assert len(parts) == 3
     assert sum(b.polygon.area for b in parts) == pytest.approx(whole.area)
+    assert {b.id for b in parts} == {"building:map:0"} and len({b.facade for b in parts}) == 1
     lengths = [math.dist(w[:2], w[2:]) for b in parts for w in b.walls]
     assert sum(lengths) == pytest.approx(whole.length)
     walls = [mesh for facade, mesh in facade_meshes(tuple(parts)).items() if facade >= 0]
