@@ -31,7 +31,7 @@ _ZENITH: Final = {
         (0.15346, -0.26756, 0.06670, 0.26688),
     ),
 }
-_HAZE: Final = np.array([0.93, 1.01, 1.10])
+_HAZE: Final = 1.5 * np.array([0.92, 1.01, 1.12])
 _LOWEST_RAD: Final = math.radians(3.0)
 """Below this the daylight formula is held, and dimmed to what is measured of twilight."""
 _TWILIGHT_DEG: Final = (-18.0, -12.0, -6.0, -4.0, -2.0, 0.0, 3.0)
@@ -64,7 +64,7 @@ def clear_sky(ways: Floats, sun: Floats, turbidity: float) -> Floats:
         parts[name] = zenith[name] * _perez(terms, cos_theta, gamma) / _perez(terms, np.ones(1), np.full(1, theta_sun))
     day = _rgb(parts["x"], parts["y"], parts["Y"])
     degrees = math.degrees(rise)
-    # By day the formula's horizon is too pink: real haze is nearly white.
+    # By day the formula's horizon is too pink and too dim beside photographs: haze is nearly white, and bright.
     white = (day @ LUMINANCE)[..., None] * _HAZE
     share = 0.8 * np.exp(-np.maximum(ways[..., 2:], 0.0) / 0.12) * float(np.clip((degrees - 6.0) / 14.0, 0.0, 1.0))
     day = np.asarray(day + share * (white - day))

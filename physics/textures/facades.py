@@ -118,7 +118,7 @@ WALL_STYLES: Final[Mapping[str, WallStyle]] = {
         uppers=("sash", "sash-fine", "square-white", "pair-green"),
         fronts=("home", "entrance", "home"),
         roofs=("roof-tiles", "roof-slate"),
-        tints=((0.62, 0.54, 0.43), (0.80, 0.79, 0.76), (0.52, 0.34, 0.29), (0.54, 0.58, 0.59), (0.72, 0.67, 0.52)),
+        tints=((0.60, 0.55, 0.47), (0.80, 0.79, 0.76), (0.52, 0.36, 0.31), (0.54, 0.58, 0.59), (0.72, 0.69, 0.60)),
     ),
     "shed": WallStyle(
         walls=("metal-corrugated", "metal-panels"),
