@@ -13,7 +13,7 @@ import numpy as np
 
 from cosim.geometry import Floats
 from physics.mesh import Mesh, box, frustum, join
-from physics.vehicles import GLASS, TYRE, vehicle_meshes
+from physics.vehicles import vehicle_parts
 
 Colour = tuple[float, float, float]
 Size = tuple[float, float, float]
@@ -206,5 +206,4 @@ def fence(size: Size) -> tuple[Part, ...]:
 
 
 def car(size: Size) -> tuple[Part, ...]:
-    body, glass, tyres = vehicle_meshes(size[0], size[1])
-    return Part(body, None), Part(glass, GLASS), Part(tyres, TYRE)
+    return tuple(Part(part.mesh, part.colour) for part in vehicle_parts("hatchback", size[0], size[1]))

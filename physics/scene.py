@@ -53,7 +53,7 @@ class Scene:
         self._post = canvas.shape(props.post_mesh())
         self._walkers = {family: Rigs(canvas, part_meshes(family), "person") for family in FAMILIES}
         self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
-        self._vehicles: dict[tuple[float, float], Rigs] = {}
+        self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
         self._robot = canvas.load(model.urdf, "robot")
@@ -137,17 +137,19 @@ class Scene:
         rows = view.rows(which.xy, VEHICLE_MARGIN_M)
         leans = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows]).tolist()
         for i, (z, roll, pitch) in zip(rows.tolist(), leans, strict=True):
-            size = (round(float(which.size[i, 0]), 1), round(float(which.size[i, 1]), 1))
-            if size not in self._vehicles:
-                self._vehicles[size] = Rigs(self._canvas, vehicles.vehicle_meshes(*size), "vehicle")
-            colours = (vehicles.paint(which.ids[i]), vehicles.GLASS, vehicles.TYRE)
-            for body, colour in zip(self._vehicles[size].lend(), colours, strict=True):
-                at = (float(which.xy[i, 0]), float(which.xy[i, 1]), z)
+            length, width = (round(float(side), 1) for side in which.size[i])
+            form = vehicles.shape(which.ids[i], length), length, width
+            parts = vehicles.vehicle_parts(*form)
+            if form not in self._vehicles:
+                self._vehicles[form] = Rigs(self._canvas, [part.mesh for part in parts], "vehicle")
+            paint = vehicles.paint(which.ids[i])
+            at = (float(which.xy[i, 0]), float(which.xy[i, 1]), z)
+            for body, part in zip(self._vehicles[form].lend(), parts, strict=True):
                 if roll or pitch:
                     self._canvas.put_turned(body, at, (roll, pitch, float(which.heading[i])))
                 else:
                     self._canvas.put(body, at, float(which.heading[i]))
-                self._canvas.paint(body, colour)
+                self._canvas.paint(body, part.colour or paint)
         for rigs in self._vehicles.values():
             rigs.finish()
 

@@ -108,7 +108,7 @@ class Scene:
         xy = street.people.xy
         seen = np.zeros(len(xy), dtype=bool)
         seen[shot.view.rows(xy, PERSON_MARGIN_M)] = True
-        casts = np.abs(xy - middle_of(shot.eye_m)).max(axis=1, initial=0.0) < REACH_M
+        casts = np.abs(xy - middle_of(shot.eye_m)[:2]).max(axis=1, initial=0.0) < REACH_M
         rows = np.flatnonzero(seen | casts if self._shadows else seen)
         who = street.people.only(rows)
         z = self._ground.heights(who.xy)
@@ -116,7 +116,7 @@ class Scene:
 
     def _cast(self, middle: Floats, street: Street, robot: Placed) -> None:
         """What throws shadows in the square around its middle, seen or not."""
-        cars = np.flatnonzero(np.abs(street.vehicles.xy - middle).max(axis=1, initial=0.0) < REACH_M)
+        cars = np.flatnonzero(np.abs(street.vehicles.xy - middle[:2]).max(axis=1, initial=0.0) < REACH_M)
         _set(self._movers, [self._vehicles(cars, street.vehicles), robot])
         still = (*middle.tolist(), *self._anchor.tolist())
         if still != self._still_for:
@@ -245,8 +245,9 @@ class Scene:
         if len(rows) == 0:
             return _NOTHING
         forms = []
-        for length, width in which.size[rows].round(1).tolist():
-            forms.append(self._forms.id(("vehicle", length, width), partial(_vehicle, length, width)))
+        for i, (length, width) in zip(rows.tolist(), which.size[rows].round(1).tolist(), strict=True):
+            shape = vehicles.shape(which.ids[i], length)
+            forms.append(self._forms.id(("vehicle", shape, length, width), partial(_vehicle, shape, length, width)))
         lean = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows])
         at = np.column_stack([which.xy[rows] - self._anchor, lean[:, 0]])
         paint = np.array([vehicles.paint(which.ids[i]) for i in rows])
@@ -269,9 +270,8 @@ def _lamp(walk: bool) -> list[Coat]:
     return [Coat(props.lamp_mesh(walk), None, glows=True)]
 
 
-def _vehicle(length_m: float, width_m: float) -> list[Coat]:
-    body, glass, tyres = vehicles.vehicle_meshes(length_m, width_m)
-    return [Coat(body), Coat(glass, vehicles.GLASS), Coat(tyres, vehicles.TYRE)]
+def _vehicle(shape: vehicles.Shape, length_m: float, width_m: float) -> list[Coat]:
+    return [Coat(part.mesh, part.colour) for part in vehicles.vehicle_parts(shape, length_m, width_m)]
 
 
 def _set(things: Things, placed: Sequence[Placed]) -> None:

@@ -22,12 +22,12 @@ STEP_M: Final = 8.0
 """The lattice of the box's middles."""
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 1024
-_MOVING_PX: Final = 1024
+_MOVING_PX: Final = 512
 
 
 def middle_of(eye_m: Floats) -> Floats:
-    """(2,) world metres: the middle of the square with shadows around an eye."""
-    return np.asarray(np.round(eye_m[:2] / STEP_M) * STEP_M)
+    """(3,) world metres: the middle of the space with shadows around an eye."""
+    return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
 def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
@@ -37,7 +37,7 @@ def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
     across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
     rows = np.stack([across, np.cross(sun, across), -sun])
     texel = 2.0 * REACH_M / _STILL_PX
-    centre = rows @ np.array([*middle, 0.0])
+    centre = rows @ middle
     centre[:2] = np.round(centre[:2] / texel) * texel
     shift = rows @ np.array([*anchor, 0.0]) - centre
     scale = np.array([1.0 / REACH_M, 1.0 / REACH_M, 1.0 / _DEEP_M])
