@@ -63,9 +63,9 @@ def fitted(found: Found, location: Mapping[str, str], street_map: StreetMap) -> 
     buildings, told = _cut_back([thing for thing in near if thing.kind == "building"], streets)
     standing, more = _settled([thing for thing in near if thing.kind != "building"], streets, buildings)
     kinds = Counter(feature.kind for feature in (*buildings, *standing))
-    words = [f"{count} {kind}{'es' if kind == 'bench' else 's'}" for kind, count in kinds.items()]
+    words = [f"{count} x {kind}" for kind, count in kinds.items()]
     changes = [f"taken from the map: {', '.join(words)}"] if words else []
-    left_out = [f"{count} {reason}" for reason, count in found.skipped.items()]
+    left_out = [f"{count} x {reason}" for reason, count in found.skipped.items()]
     if left_out:
         changes.append(f"left out: {', '.join(left_out)}")
     return (*buildings, *standing), [*changes, *told, *more]
@@ -171,9 +171,9 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
             found.append(Feature("building", round(x, 2), round(y, 2), heading, round(thing.height_m, 2), part))
     told = []
     if cut:
-        told.append(f"{cut} buildings that reached into streets are cut back: what is walked on wins")
+        told.append(f"buildings cut back where they reached into streets (what is walked on wins): {cut}")
     if dropped:
-        told.append(f"{dropped} buildings that lay mostly on streets are left out")
+        told.append(f"buildings left out that lay mostly on streets: {dropped}")
     return found, told
 
 
@@ -211,13 +211,13 @@ def _settled(
         closed = shapely.union(streets.closed(spot), houses.union(spot, 2.0 * MOVED_M))
         at = _free_spot(spot, closed, radius)
         if at is None:
-            counts["left out: they stood on a road, a crossing or in a narrow passage"] += 1
+            counts["left out on a road, a crossing or in a narrow passage"] += 1
             continue
         xy = np.array([round(at.x, 2), round(at.y, 2)])
         i, j = (math.floor(c / _CELL_M) for c in xy)
         rivals = [rival for a in (-1, 0, 1) for b in (-1, 0, 1) for rival in stood.get((i + a, j + b), ())]
         if any(np.hypot(*(xy - other)) < radius + reach + GAP_M for other, reach in rivals):
-            counts["left out: another one stands there"] += 1
+            counts["left out where another one stands"] += 1
             continue
         if at is not spot:
             counts["moved aside by up to 3 m, off the road or the middle of a sidewalk"] += 1
@@ -227,7 +227,7 @@ def _settled(
         heading = round(math.remainder(turned, 2.0 * math.pi), 4)
         kind = cast(FeatureKind, thing.kind)
         found.append(Feature(kind, float(xy[0]), float(xy[1]), heading, round(thing.height_m, 2)))
-    return found, [f"{count} mapped things {what}" for what, count in counts.items()]
+    return found, [f"mapped things {what}: {count}" for what, count in counts.items()]
 
 
 def _free_spot(spot: Point, closed: shapely.Geometry, radius_m: float) -> Point | None:

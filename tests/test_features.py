@@ -153,11 +153,11 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     sidewalks; what was moved, cut back or left out is told."""
     street_map, changes = drawn
     told = " | ".join(changes)
-    assert "taken from the map: 2 buildings" in told
-    assert "1 buildings that reached into streets are cut back" in told
-    assert "1 buildings that lay mostly on streets are left out" in told
-    assert "1 mapped things moved aside" in told
-    assert "2 mapped things left out: they stood on a road" in told
+    assert "taken from the map: 2 x building, 3 x tree" in told
+    assert "buildings cut back where they reached into streets (what is walked on wins): 1" in told
+    assert "buildings left out that lay mostly on streets: 1" in told
+    assert "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1" in told
+    assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in told
     lanes = [p.polygon for p in street_map.lanes.values() if p.kind == "road"]
     walked = [p.polygon for p in (*street_map.strips.values(), *street_map.corners.values())]
     streets = shapely.union_all([*lanes, *walked])

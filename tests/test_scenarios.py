@@ -64,6 +64,21 @@ def test_a_place_says_how_rough_its_ground_is() -> None:
 
 
 @pytest.mark.engine
+def test_roughness_can_be_asked_for_on_a_map_alone() -> None:
+    """`--roughness` goes into the scenarios' place; without `--map`, or out of range, it is refused with the reason."""
+    from typer.testing import CliRunner
+
+    from cosim.cli import app
+
+    for options, reason in (
+        (["--roughness", "0.3"], "--roughness goes with --map"),
+        (["--map", "anything", "--roughness", "2"], "roughness is 2, but it lies between 0"),
+    ):
+        refused = CliRunner().invoke(app, ["run", "long-horizon", *options])
+        assert refused.exit_code != 0 and reason in str(refused.exception)
+
+
+@pytest.mark.engine
 def test_free_space_ends_at_furniture() -> None:
     """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
     from physics.furniture import Prop, footprints
