@@ -239,12 +239,11 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
 
 
 def _starts(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[Strip]:
-    steep = street_map.elevation.steep if street_map.elevation is not None else ()
     return [
         s
         for s in street_map.strips.values()
         if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= NARROW_M
-        if s.id not in steep
+        if s.id not in street_map.steep
     ]
 
 

@@ -158,10 +158,14 @@ class StreetMap:
     @cached_property
     def too_steep(self) -> frozenset[Port]:
         """Ports that no robot is sent past because the land is too steep there; people pass."""
-        if self.elevation is None:
-            return frozenset()
-        whole = {port for strip in self.elevation.steep for port in (Port(strip, 0), Port(strip, 1))}
-        return frozenset(whole | {Port(strip, 1 if end else 0) for strip, end in self.elevation.closed})
+        whole = {port for strip in self.steep for port in (Port(strip, 0), Port(strip, 1))}
+        closed = self.elevation.closed if self.elevation is not None else ()
+        return frozenset(whole | {Port(strip, 1 if end else 0) for strip, end in closed})
+
+    @cached_property
+    def steep(self) -> frozenset[str]:
+        """Strips that no robot is sent over because the land is too steep there."""
+        return frozenset(self.elevation.steep if self.elevation is not None else ())
 
     def near(self, kind: PieceKind, area: shapely.Geometry) -> list[Piece]:
         """Pieces of `kind` whose polygon touches `area`, in the net's order."""

@@ -40,7 +40,7 @@ def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scen
         strip_id
         for strip_id in graph.main_strips
         if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= STRIP_MIN_M
-        if Port(strip_id, 0) not in street_map.too_steep
+        if strip_id not in street_map.steep
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")

@@ -63,7 +63,8 @@ def build(kind: Kind, place: Place, street_map: StreetMap, graph: WalkGraph, see
     """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is found."""
     rng = np.random.default_rng([seed, place.seed, 0x4EAC7, sorted(GROUPS).index(kind)])
     wanted = "crossing" if kind == "ped_crossing" else "sidewalk"
-    strips = [street_map.strips[s] for s in sorted(graph.main_strips) if street_map.strips[s].kind == wanted]
+    even = sorted(graph.main_strips - street_map.steep)
+    strips = [street_map.strips[s] for s in even if street_map.strips[s].kind == wanted]
     if not strips:
         raise MapError(f"map '{street_map.name}' has no {wanted} for '{kind}'")
     refusals: dict[str, int] = {}

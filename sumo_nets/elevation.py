@@ -181,6 +181,9 @@ def _without_false_points(courses: Sequence[Course], heights: Floats) -> list[Co
     every[(heights == 0.0) & (np.abs(beside) > FALSE_GRADE * gap + _STEP_M), 2] = np.nan
     out = []
     for c, points in zip(courses, np.split(every, ends), strict=True):
+        if c.ring and not np.nan_to_num(points[:, 2]).any():
+            # Corners mended on import have lost their elevations, and others say no more than the streets they join.
+            points[:, 2] = np.nan
         _drop_zeros(points)
         _drop_spikes(points)
         on: On = c.on if c.on != "path" else "steps" if _climb(points) > ROBOT_GRADE_MAX else "street"
