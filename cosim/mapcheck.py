@@ -75,7 +75,7 @@ class Island(msgspec.Struct, frozen=True):
 class Problem(msgspec.Struct, frozen=True):
     """Something wrong at one strip.
 
-    kind: island, narrow, on_road, stacked, never_green, always_green, level or misfit.
+    kind: island, narrow, on_road, stacked, steep, never_green, always_green, level or misfit.
     """
 
     kind: str
@@ -113,6 +113,7 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     on_road: int
     stacked: int
     guessed_share: float | None
+    elevation: Elevation | None
     facts: NetFacts | None
     unit_possible: bool
     long_horizon_possible: bool
@@ -151,6 +152,7 @@ def check_map(
         *_marks("narrow", narrow),
         *_marks("on_road", on_road),
         *_marks("stacked", stacked),
+        *_marks("steep", [s for s in strips if s.id in street_map.steep]),
     ]
     if facts is not None:
         for kind in ("never_green", "always_green", "levels", "misfits"):
@@ -178,11 +180,12 @@ def check_map(
         on_road=len(on_road),
         stacked=len(stacked),
         guessed_share=guessed_share,
+        elevation=street_map.elevation,
         facts=facts,
         unit_possible=not unit,
         long_horizon_possible=not long_horizon,
         reasons=tuple(reasons),
-        notes=(*(() if reasons else (*unit, *long_horizon)), *_land_notes(street_map.elevation), *_notes(facts)),
+        notes=(*(() if reasons else (*unit, *long_horizon)), *_land_notes(street_map), *_notes(facts)),
         problems=tuple(marked),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
@@ -302,7 +305,8 @@ def _notes(facts: NetFacts | None) -> list[str]:
     return notes
 
 
-def _land_notes(elevation: Elevation | None) -> list[str]:
+def _land_notes(street_map: StreetMap) -> list[str]:
+    elevation = street_map.elevation
     if elevation is None:
         return []
     span = f"elevation {round(elevation.low_m)} to {round(elevation.high_m)} m"
@@ -314,9 +318,10 @@ def _land_notes(elevation: Elevation | None) -> list[str]:
         f"no street or walkway rises more than {WALK_GRADE_MAX:.0%} along its line"
     ]
     if elevation.steep:
+        km = sum(street_map.strips[strip].length_m for strip in elevation.steep) / 1000.0
         notes.append(
-            f"{len(elevation.steep)} walkways are steeper than {ROBOT_GRADE_MAX:.0%} somewhere (steps, hill paths, "
-            "terraces closer together than heights can show): no robot is sent over them"
+            f"{len(elevation.steep)} walkways ({km:.1f} km) are steeper than {ROBOT_GRADE_MAX:.0%} somewhere (steps, "
+            "hill paths, terraces closer together than heights can show): no robot is sent over them"
         )
     return notes
 

@@ -178,10 +178,11 @@ def test_notes_say_what_is_not_used() -> None:
     assert "elevation 0 to 90 m is dropped, the ground is flat: it is the same" in check_map(false).notes[-1]
     kept = dataclasses.replace(town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),)))
     notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
+    assert [p.strip for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
     for words in (
         "elevation 0 to 90 m is kept; 7 of 50 points had none or a false one",
         "3 places on streets were moved, by up to 1.2 m",
-        "1 walkways are steeper than 20% somewhere",
+        "km) are steeper than 20% somewhere",
         "0.20 km that people share with cars",
         "1 walkable edges (0.30 km) are on bridges",
         "1 walkable lanes name no width",

@@ -24,6 +24,7 @@ MARKS: Final[dict[str, tuple[Colour, str]]] = {
     "never_green": ((120, 0, 0), "signal never green"),
     "always_green": ((0, 120, 200), "signal always green"),
     "misfit": ((90, 60, 30), "signal without a program that fits"),
+    "steep": ((120, 40, 160), "too steep for robots"),
     "level": ((40, 60, 220), "bridge or tunnel"),
 }
 """Colour and meaning of each kind of problem."""
