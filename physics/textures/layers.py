@@ -83,9 +83,10 @@ def stacked(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
     finish = None
     for k, (name, recipe) in enumerate(recipes.items()):
         picture = recipe.make(Noise(size_px, (seed, *name.encode())))
-        rgba[k, ..., :3] = quantised(picture.rgb)
+        rgb = quantised(picture.rgb)
+        rgba[k, ..., :3] = rgb
         rgba[k, ..., 3] = 255 if picture.alpha is None else quantised(picture.alpha)
-        mean[k] = mean_linear(rgba[k, ..., :3])
+        mean[k] = mean_linear(rgb)
         if picture.finish is not None:
             finish = np.zeros((len(recipes), size_px, size_px, 2), np.uint8) if finish is None else finish
             finish[k] = quantised(picture.finish)
@@ -128,5 +129,5 @@ def quantised(values: NDArray[np.floating[Any]]) -> NDArray[np.uint8]:
 
 def mean_linear(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
     """(3,) linear mean of an sRGB picture (..., 3)."""
-    counts = [cv2.calcHist([np.ascontiguousarray(rgb)], [c], None, [256], [0, 256]).ravel() for c in range(3)]
+    counts = [cv2.calcHist([rgb], [c], None, [256], [0, 256]).ravel() for c in range(3)]
     return np.array([LINEAR @ count / count.sum() for count in counts], dtype=np.float32)
