@@ -71,8 +71,8 @@ def test_the_sun_stands_where_the_picture_shows_it() -> None:
     assert directions(rows)[row, column] @ sky.sun > 0.999
 
 
-@pytest.mark.parametrize("cover", [0.0, 0.3, 0.7, 1.0])
-@pytest.mark.parametrize("hour", [0.0, 4.0, 5.5, 8.0, 12.0, 20.0])
+@pytest.mark.parametrize("cover", [0.0, 0.6, 1.0])
+@pytest.mark.parametrize("hour", [0.0, 4.5, 12.0, 20.0])
 def test_every_sky_is_usable(hour: float, cover: float) -> None:
     """Finite, never negative, exposed so that a grey card in the open is neither black nor white."""
     sky = sky_of(Light(hour=hour, cloud_cover=cover), seed=3)
