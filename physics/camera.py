@@ -18,6 +18,7 @@ from cosim.errors import EngineError
 from cosim.ports import CameraSpec
 from cosim.state import LABELS, Frame, RobotState, Street
 from physics.canvas import Canvas
+from physics.lens import drawn, through
 from physics.scene import Scene
 from physics.view import FAR_M, NEAR_M, Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
@@ -35,7 +36,7 @@ class BulletCamera:
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
-        self.spec = spec
+        self.spec, self._pinhole = spec, drawn(spec)
         self._world = world
         self._depth = depth
         self._canvas: Canvas | None = None
@@ -59,8 +60,10 @@ class BulletCamera:
             self._canvas = self._scene = None
 
     def render(self, robot: RobotState, street: Street) -> Frame:
-        """What the robot sees from its mount; it leans with the ground, and its own body is not in the picture."""
-        return self._drawn(robot_shot(self._world.ground, self._world.model, self.spec, robot), street, None)
+        """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
+        the picture."""
+        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
+        return through(self.spec, self._drawn(taken, street, None), robot, self._world.ground.seed, street.tick)
 
     def picture(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import cv2
@@ -10,8 +11,8 @@ import pytest
 
 from cosim.errors import EngineError, UsageError
 from cosim.geometry import Pose
-from cosim.ports import CameraSpec
-from cosim.scenario import Barrier, City
+from cosim.ports import CameraSpec, Lens
+from cosim.scenario import Barrier, City, Light
 from cosim.state import LABELS, Frame, People, RobotState, Signal, Street, Vehicles
 from cosim.streetmap import StreetMap, Strip
 from physics.camera import BulletCamera
@@ -136,6 +137,33 @@ def test_the_robot_is_seen_from_outside_only(world: BulletWorld) -> None:
     seen = outside.labels == LABELS["robot"]
     assert 0.02 < seen.mean() < 0.4
     assert 1.2 < outside.depth[seen].min() < 2.5
+
+
+def test_light_changes_colours_and_nothing_else(world: BulletWorld) -> None:
+    """Noon, noon without shadows, overcast, fog and night show the same labels and depths in other colours."""
+    robot, street = moment(world)
+    lights = [Light(), Light(shadows=False), Light(cloud_cover=1.0), Light(fog_m=40.0), Light(hour=23.0)]
+    frames = []
+    for light in lights:
+        with GlCamera(world, SPEC, depth=True, light=light) as camera:
+            frames.append(camera.render(robot, street))
+    for k, frame in enumerate(frames):
+        assert np.array_equal(frame.labels, frames[0].labels) and np.array_equal(frame.depth, frames[0].depth)
+        assert all(np.abs(frame.rgb.astype(int) - other.rgb).mean() > 0.5 for other in frames[:k])
+
+
+@pytest.mark.parametrize("make", [GlCamera, BulletCamera])
+def test_a_lens_bends_what_a_camera_draws(make: type[GlCamera | BulletCamera], world: BulletWorld) -> None:
+    """Behind a lens the picture has the camera's size, and what was at its edge has moved inwards."""
+    robot, street = moment(world)
+    barrel = dataclasses.replace(SPEC, fov_deg=50.0, lens=Lens(k1=-0.1))
+    with make(world, dataclasses.replace(SPEC, fov_deg=50.0)) as plain, make(world, barrel) as bent:
+        straight, curved = plain.render(robot, street), bent.render(robot, street)
+    assert curved.rgb.shape == straight.rgb.shape
+    assert curved.labels is not None and straight.labels is not None
+    middle = np.s_[44:52, 60:68]
+    assert (curved.labels[middle] == straight.labels[middle]).mean() > 0.9
+    assert np.abs(curved.rgb.astype(int) - straight.rgb).mean() > 1.0
 
 
 def test_absurd_pictures_are_refused(world: BulletWorld) -> None:

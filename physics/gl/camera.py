@@ -24,6 +24,7 @@ from physics.gl.scene import Scene
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.gl.shadows import ShadowMaps, middle_of, shadow_matrix
 from physics.gl.targets import Target
+from physics.lens import drawn, through
 from physics.sky import sky_of
 from physics.view import Shot, check_size, robot_shot, shot
 from physics.world import BulletWorld
@@ -39,7 +40,7 @@ class GlCamera:
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
-        self.spec = spec
+        self.spec, self._pinhole = spec, drawn(spec)
         self._world, self._depth, self._sky = world, depth, sky_of(light, world.ground.seed)
         self._light = lighting_of(self._sky)
         self._context: moderngl.Context | None = None
@@ -49,7 +50,7 @@ class GlCamera:
         if self._context is None:
             world, shadows = self._world, self._light.shadows
             with context() as gl:
-                self._scene = Scene(gl, world.ground, world.barriers, world.model, shadows)
+                self._scene = Scene(gl, world.ground, world.barriers, world.model, self._light)
                 self._shadows = ShadowMaps(gl) if shadows else None
                 self._block = SceneBlock(gl)
                 self._backdrop = Backdrop(gl, self._sky)
@@ -75,9 +76,11 @@ class GlCamera:
             self._context = None
 
     def render(self, robot: RobotState, street: Street) -> Frame:
-        """What the robot sees from its mount; it leans with the ground, and its own body is not in the picture."""
-        taken = robot_shot(self._world.ground, self._world.model, self.spec, robot)
-        return self._drawn(taken, street, robot, body=False)
+        """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
+        the picture."""
+        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
+        frame = self._drawn(taken, street, robot, body=False)
+        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
 
     def picture(
         self,

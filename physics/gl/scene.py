@@ -21,6 +21,7 @@ from physics.furniture import KINDS, parts_of
 from physics.gl.corners import Rows
 from physics.gl.crowd import Crowd
 from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
+from physics.gl.lighting import Lighting
 from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
 from physics.gl.shadows import REACH_M, STEP_M, middle_of
@@ -66,14 +67,14 @@ class Scene:
     """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
 
     def __init__(
-        self, context: moderngl.Context, ground: Ground, barriers: Sequence[Barrier], model: RobotModel, shadows: bool
+        self, context: moderngl.Context, ground: Ground, barriers: Sequence[Barrier], model: RobotModel, light: Lighting
     ) -> None:
         self._context, self._ground, self._model = context, ground, model
         self._tiles: dict[Key, _Tile] = {}
-        self._shadows = shadows
+        self._shadows = shadows = light.shadows
         self._surfaces = surfaces(context)
         self._shaders = TileShaders(context, self._surfaces, shadows)
-        self._wall_shaders = WallShaders(context, self._surfaces, shadows)
+        self._wall_shaders = WallShaders(context, self._surfaces, shadows, light.lamps > 0.0)
         self._forms = Forms(context, shadows)
         self._seen = Things(context, self._forms, ("colour",))
         self._standing = Things(context, self._forms, ("still",))

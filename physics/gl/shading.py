@@ -30,7 +30,8 @@ The uniform block `Scene` (binding SCENE_BINDING, written once per pass by `Scen
     vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half its width and height
 
 Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks and drives), SKY_UNIT
-holds the sky, SURFACES_UNIT and FACADES_UNIT the textures of ground and walls; free for drawables are units 0 to 2.
+holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free for drawables are
+units 0 and 1.
 
 A drawable takes part in a pass by
 
@@ -57,6 +58,7 @@ from physics.view import FAR_M, NEAR_M, Shot
 Stage = Literal["colour", "still", "moving"]
 
 SCENE_BINDING: Final = 0
+FINISH_UNIT: Final = 2
 SURFACES_UNIT: Final = 3
 FACADES_UNIT: Final = 4
 SKY_UNIT: Final = 5

@@ -10,7 +10,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from physics.gl.shading import FACADES_UNIT, SURFACES_UNIT
+from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined
@@ -38,11 +38,11 @@ class Surfaces:
     surfaces: Layers
     facades: Layers
     known: bytes
-    _arrays: tuple[moderngl.TextureArray, moderngl.TextureArray]
+    _arrays: tuple[moderngl.TextureArray, ...]
 
     def bind(self) -> None:
-        self._arrays[0].use(SURFACES_UNIT)
-        self._arrays[1].use(FACADES_UNIT)
+        for array, unit in zip(self._arrays, (SURFACES_UNIT, FACADES_UNIT, FINISH_UNIT), strict=True):
+            array.use(unit)
 
 
 @lru_cache(maxsize=1)
@@ -51,12 +51,14 @@ def surfaces(context: moderngl.Context) -> Surfaces:
     flat, facades = joined(ground_layers(SIZE_PX), wall_layers(SIZE_PX)), facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]
-    return Surfaces(flat, facades, known.tobytes(), (_array(context, flat.rgba), _array(context, facades.rgba)))
+    assert facades.finish is not None
+    arrays = tuple(_array(context, texels) for texels in (flat.rgba, facades.rgba, facades.finish))
+    return Surfaces(flat, facades, known.tobytes(), arrays)
 
 
-def _array(context: moderngl.Context, rgba: NDArray[np.uint8]) -> moderngl.TextureArray:
-    count, size, _, _ = rgba.shape
-    array = context.texture_array((size, size, count), 4, rgba.tobytes())
+def _array(context: moderngl.Context, texels: NDArray[np.uint8]) -> moderngl.TextureArray:
+    count, size, _, channels = texels.shape
+    array = context.texture_array((size, size, count), channels, texels.tobytes())
     array.build_mipmaps()
     array.filter = moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR
     array.repeat_x = array.repeat_y = True

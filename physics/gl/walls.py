@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cosim.geometry import Floats
 from cosim.state import LABELS
 from physics.buildings import Building, facade_meshes
-from physics.gl.shading import FACADES_UNIT, Programs, Stage, programs, put
+from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Programs, Stage, programs, put
 from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.mesh import Mesh
 from physics.textures.facade_canvas import BAY_M, STOREY_M
@@ -32,8 +32,11 @@ _CORNER: Final = np.dtype(
 )  # fmt: skip
 """normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres, in bays and storeys;
 kind: first layer of the upper storeys' windows, storeys, whether it looks to the street, chance;
-fronts: first layers of three fronts, chance."""
+fronts: layers of three fronts, chance."""
 _LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "in_spot", "in_kind", "in_fronts")
+_LIT_SHARE: Final = 0.35
+_LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
+"""Radiance of a lit window, in the units of physics.sky: some 60 candela per square metre."""
 _LEAST_M: Final = 2.2
 """A narrower wall has no windows."""
 
@@ -62,6 +65,7 @@ _FRAGMENT: Final = (
     LOOKED_UP
     + f"""
 layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
+layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
 in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
 flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts;
 float chance(vec2 cell, float of) {{
@@ -75,23 +79,29 @@ void main() {{
     vec2 cell = floor(cells);
     float drawn = chance(cell, kind.w + 7.0 * fronts.w);
     float which = drawn * 3.0;
+    bool ground_floor = cell.y < 0.5 && kind.z > 0.5;
     float front = which < 1.0 ? fronts.x : which < 2.0 ? fronts.y : fronts.z;
-    float first = cell.y < 0.5 && kind.z > 0.5 ? front : kind.x;
-    float layer = first + floor(fract(drawn * 17.0) * {VARIANTS}.0);
+    float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {VARIANTS}.0);
     vec4 bay = texture(facades, vec3(cells.x, -cells.y, layer));
     bool none = cell.y < 0.0 || cell.y >= kind.y;
     albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
-    show_linear(albedo, vec3(0.0), normal, at, {LABELS["building"]}.0);
+    vec3 own = vec3(0.0);
+#ifdef NIGHT
+    float lit = ground_floor || fract(drawn * 29.0) < {_LIT_SHARE} ? side_light.w : 0.0;
+    own = none ? own : vec3({_LAMPLIGHT}) * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
+#endif
+    show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
 }}
 """
 )
 
 
 class WallShaders:
-    """The program of all buildings."""
+    """The program of all buildings. night: whether some of their windows are lit."""
 
-    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
-        self.programs: Programs = programs(context, _VERTEX, _FRAGMENT, shadows)
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool) -> None:
+        fragment = ("#define NIGHT\n" if night else "") + _FRAGMENT
+        self.programs: Programs = programs(context, _VERTEX, fragment, shadows)
         self.surfaces = surfaces
         for program in self.programs:
             if "layers" in program:
@@ -139,7 +149,8 @@ def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[
     wall = layers.index(str(rng.choice(style.walls)))
     roof = layers.index(str(rng.choice(style.roofs)))
     upper = bays.index(f"{rng.choice(style.uppers)}-0")
-    fronts = [bays.index(f"{name}-0") for name in rng.choice(style.fronts, 3)]
+    number = int(rng.integers(VARIANTS))
+    fronts = [bays.index(f"{name}-{number}") for name in rng.choice(style.fronts, 3)]
     colour = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
     chance = rng.integers(0, 256, 2)
     street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
