@@ -128,18 +128,18 @@ def steep_ports(
     terrain: Terrain, strips: Mapping[str, Strip], corners: Iterable[Corner], steep: Collection[str]
 ) -> tuple[tuple[str, int], ...]:
     """Ports, strip and end, to close so that no straight way across a corner is too steep: the worst ones first."""
+    met = [[port for port in dict.fromkeys(corner.ports) if port.strip not in steep] for corner in corners]
+    ways = [pair for ports in met for pair in combinations(ports, 2)]
+    if not ways:
+        return ()
+    lines = [np.array([strips[port.strip].line[-port.end] for port in pair]) for pair in ways]
+    too_steep = {pair for pair, found in zip(ways, _steep(terrain, lines, [0.2] * len(ways)), strict=True) if found}
     shut: list[tuple[str, int]] = []
-    for corner in corners:
-        ports = [port for port in dict.fromkeys(corner.ports) if port.strip not in steep]
-        pairs = list(combinations(range(len(ports)), 2))
-        if not pairs:
-            continue
-        at = [strips[port.strip].line[-port.end] for port in ports]
-        found = _steep(terrain, [np.array([at[i], at[k]]) for i, k in pairs], [0.2] * len(pairs))
-        left = [pair for pair, is_steep in zip(pairs, found, strict=True) if is_steep]
+    for ports in met:
+        left = [pair for pair in combinations(ports, 2) if pair in too_steep]
         while left:
-            worst = int(np.bincount(np.array(left).ravel()).argmax())
-            shut.append((ports[worst].strip, ports[worst].end))
+            worst = max(ports, key=lambda port: sum(port in pair for pair in left))
+            shut.append((worst.strip, worst.end))
             left = [pair for pair in left if worst not in pair]
     return tuple(shut)
 

@@ -14,11 +14,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.geometry import Pose
-from cosim.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Terrain
+from cosim.streetmap import Corner, Port
+from cosim.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
 from physics.ground import Ground
 from physics.robots import robot
 from physics.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
-from sumo_nets.elevation import steep_strips, surveyed
+from sumo_nets.atlas import frozen, thawed
+from sumo_nets.elevation import steep_ports, steep_strips, surveyed
 from sumo_nets.profile import Course, Meeting, On, clamped, course, what_lies_there
 
 _spec = importlib.util.spec_from_file_location("tiles_of_tests", Path(__file__).with_name("test_tiles.py"))
@@ -276,6 +278,31 @@ def test_nothing_floats_on_a_hill() -> None:
     east, north = terrain.gradient([(20.0, 1.0)])[0]
     assert z == pytest.approx(float(terrain.height([(20.0, 1.0)])[0]), abs=0.03)
     assert (math.tan(-pitch), math.tan(roll)) == pytest.approx((east, north), abs=0.02)
+
+
+def test_a_snapshot_keeps_the_land() -> None:
+    """Terrain and elevation come back from a snapshot to the bit; a flat map comes back flat."""
+    told = Elevation(1.5, 9.0, 20, 3, 0.01, 4, 0.5, ("a", "b"), (("c", 1),))
+    again = thawed(frozen(dataclasses.replace(HILLY, elevation=told)))
+    assert again.terrain is not None and HILLY.terrain is not None and again.elevation == told
+    assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
+    assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
+    assert again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
+    flat = thawed(frozen(_tiles.tiny_map()))
+    assert flat.terrain is None and flat.elevation is None
+
+
+def test_corners_too_steep_to_cross_are_closed() -> None:
+    """Of three ports the one above the others is closed; on level land none is."""
+    cliff = np.where(np.arange(40)[:, None] >= 22, 10.0, 0.0) * np.ones((1, 40))
+    terrain = Terrain(-40.0, -40.0, 2.0, cliff.astype(np.float32))
+    strip = next(iter(_tiles.tiny_map().strips.values()))
+    ends = {"low1": [(-20.0, 0.0), (-5.0, 0.0)], "low2": [(20.0, 0.0), (5.0, 0.0)], "high": [(0.0, 6.0), (0.0, 20.0)]}
+    strips = {n: dataclasses.replace(strip, id=n, line=np.array(line), width_m=2.0) for n, line in ends.items()}
+    corner = Corner("w", shapely.box(-5, -2, 5, 6), (Port("low1", 1), Port("low2", 1), Port("high", 0)))
+    assert steep_ports(terrain, strips, [corner], ()) == (("high", 0),)
+    level = Terrain(-40.0, -40.0, 2.0, np.zeros((40, 40), dtype=np.float32))
+    assert steep_ports(level, strips, [corner], ()) == ()
 
 
 def test_flat_ground_is_what_it_was() -> None:
