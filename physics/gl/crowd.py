@@ -100,8 +100,8 @@ void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
 class _Bodies:
     """Bodies of all outfits at all levels in one vertex and one index buffer; they are made when first needed."""
 
-    def __init__(self, context: moderngl.Context) -> None:
-        self._context = context
+    def __init__(self, context: moderngl.Context, worn: Body | None) -> None:
+        self._context, self._worn = context, worn
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._starts: dict[tuple[int, int], tuple[int, int, int]] = {}
@@ -110,9 +110,9 @@ class _Bodies:
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
         """Count of indices, first index, first vertex."""
-        key = outfit, level
+        key = (outfit, level) if self._worn is None else (0, 0)
         if key not in self._starts:
-            made = body(ALL[outfit], level)
+            made = body(ALL[outfit], level) if self._worn is None else self._worn
             first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
             self._rows.append(corners(made))
             self._indices.append(made.triangles.ravel().astype(np.uint32))
@@ -153,9 +153,14 @@ class _Arrays(NamedTuple):
 
 
 class Crowd:
-    """The people of a picture. shadows: whether they are shaded by shadow maps."""
+    """The people of a picture. shadows: whether they are shaded by shadow maps.
 
-    def __init__(self, context: moderngl.Context, shadows: bool, clips: Clips | None = None) -> None:
+    worn: a body that everybody wears, with clips made for it (`clips_for`), instead of our own.
+    """
+
+    def __init__(
+        self, context: moderngl.Context, shadows: bool, worn: Body | None = None, clips: Clips | None = None
+    ) -> None:
         self._context = context
         self._clips = own_clips() if clips is None else clips
         matrices = self._clips.matrices
@@ -163,7 +168,7 @@ class Crowd:
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
         self._programs = [programs(context, f"#define BONES {k}\n" + _VERTEX, _FRAGMENT, shadows) for k in (4, 2)]
-        self._bodies = _Bodies(context)
+        self._bodies = _Bodies(context, worn)
         self._bound = -1
         self._arrays: list[_Arrays] = []
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from cosim.gait import PACES_MPS
 from cosim.geometry import Floats
+from physics.people.captures import Capture
 from physics.people.families import FAMILIES, Family, skeleton
 from physics.people.gaits import FRAMES as STRIDE_FRAMES
 from physics.people.gaits import gait
@@ -47,8 +48,11 @@ def own_clips() -> Clips:
     return baked([(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES])
 
 
-def baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
-    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
+def baked(bodies: list[tuple[Skeleton, float, Floats]], walk: Capture | None = None) -> Clips:
+    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled.
+
+    walk: one stride, taken instead of the shipped walk.
+    """
     rows: list[NDArray[np.float32]] = []
     walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
     standing = {name: np.zeros(len(bodies), dtype=np.intp) for name in GESTURES}
@@ -57,7 +61,7 @@ def baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
         bind = bind_of(body, modelled)
         for knot in range(len(PACES_MPS)):
             walking[k, knot] = at
-            rows.append(skinning(*forward(*gait(knot, body, stoop_rad), body), bind))
+            rows.append(skinning(*forward(*gait(knot, body, stoop_rad, walk), body), bind))
             at += len(rows[-1])
         for name, first in standing.items():
             first[k] = at
@@ -66,6 +70,11 @@ def baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
     matrices = np.concatenate(rows)
     matrices.flags.writeable = False
     return Clips(matrices, walking, MappingProxyType(standing))
+
+
+def clips_for(body: Skeleton, walk: Capture | None = None) -> Clips:
+    """The motions of one body that everybody wears, modelled in the T pose, such as a user's SMPL body."""
+    return baked([(body, 0.0, model_pose(0.0))] * len(FAMILIES), walk)
 
 
 def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:

@@ -8,7 +8,7 @@ trunk, head and arms are those of the captures; how far a capture's motion goes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Final
 
@@ -84,13 +84,17 @@ class _Cycle:
     sway_m: Floats
 
 
-def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
+def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0, walk: Capture | None = None) -> tuple[Floats, Floats]:
     """The stride at the pace `cosim.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis (FRAMES, 3) metres.
 
-    The body stays above the origin. stoop_rad: how far the back is bent.
+    The body stays above the origin. stoop_rad: how far the back is bent. walk: one stride, from one touch of the left
+    heel to the next, whose trunk, head and arms are taken instead of the shipped walk's.
     """
     style = _RUN if PACES_MPS[knot] > _RUNS_FROM_MPS else _WALK
-    cycle = _cycle(style)
+    if walk is not None and style is _WALK:
+        cycle = _cycle_of(walk, replace(style, frames=len(walk.turns) - 1, touch=0.0))
+    else:
+        cycle = _cycle(style)
     scale = skeleton.height_m / REFERENCE_M
     stride_m = STRIDES_M[knot] * scale
     share = min(STRIDES_M[knot] / style.stride_m, 1.25)

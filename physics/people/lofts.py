@@ -61,9 +61,12 @@ def lofted(piece: Piece, level: int) -> Surface:
     table = _table(piece.rings)
     table = _chosen(table, piece.rings_kept[level])
     sides = piece.sides[level]
-    angle = 2.0 * np.pi * (np.arange(sides) + 0.5 * (sides % 2 == 0)) / sides
-    grow = np.pi / (sides * np.sin(np.pi / sides))
-    rings = _points(table, angle, grow)
+    boxy = sides % 8 == 0 and float(table[:, 10].mean()) > 2.8
+    corners = 0.0 if boxy or sides % 2 else 0.5
+    angle = 2.0 * np.pi * (np.arange(sides) + corners) / sides
+    rings = _points(table, angle)
+    grow = _perimeters(_points(table, _ROUND)) / np.maximum(_perimeters(rings), 1e-9)
+    rings = table[:, None, :3] + grow[:, None, None] * (rings - table[:, None, :3])
     n, k = len(table), sides
     ends = table[[0, -1], :3]
     vertices = np.concatenate([rings.reshape(-1, 3), ends])
@@ -97,6 +100,7 @@ def ball(
 
 
 _WIDTH: Final = 12 + 24 + 1
+_ROUND: Final = 2.0 * np.pi * np.arange(64) / 64
 
 
 def _table(rings: Sequence[Ring]) -> Floats:
@@ -118,7 +122,21 @@ def _chosen(table: Floats, wanted: int) -> Floats:
     while len(kept) > max(wanted, 2):
         cost = [_loss(table, kept[i - 1], kept[i], kept[i + 1]) for i in range(1, len(kept) - 1)]
         del kept[1 + int(np.argmin(cost))]
-    return table[kept]
+    return _fitted(table, kept)
+
+
+def _fitted(table: Floats, kept: list[int]) -> Floats:
+    """The kept rings, moved and resized so that what is straight between them runs through the finer shape, not
+    inside it: a least squares fit. Both ends stay."""
+    fine = _between(table, 5 * len(table))
+    way = np.concatenate([[0.0], np.cumsum(_gaps(fine))])
+    at = way[[int(np.argmin(np.abs(fine[:, :9] - table[k, :9]).sum(axis=1))) for k in kept]]
+    hats = np.stack([np.interp(way, at, unit) for unit in np.eye(len(kept))], axis=1)
+    length = np.sqrt(np.gradient(way))[:, None]
+    rings = table[kept].copy()
+    rest = fine[:, :10] - hats[:, [0, -1]] @ rings[[0, -1], :10]
+    rings[1:-1, :10] = np.linalg.lstsq(length * hats[:, 1:-1], length * rest, rcond=None)[0]
+    return rings
 
 
 def _loss(table: Floats, before: int, middle: int, after: int) -> float:
@@ -154,14 +172,18 @@ def _gaps(table: Floats) -> Floats:
     return np.asarray(np.sqrt((step**2).sum(axis=1)) + 1e-6)
 
 
-def _points(table: Floats, angle: Floats, grow: float) -> Floats:
+def _points(table: Floats, angle: Floats) -> Floats:
     """(K, A, 3) points on the rings."""
     cos, sin = np.cos(angle), np.sin(angle)
     power = (2.0 / table[:, 10])[:, None]
     x = np.sign(cos) * np.abs(cos) ** power * np.where(cos < 0.0, table[:, 9:10], 1.0)
     y = np.sign(sin) * np.abs(sin) ** power
-    flat = x[..., None] * table[:, None, 3:6] + y[..., None] * table[:, None, 6:9]
-    return np.asarray(table[:, None, :3] + grow * flat)
+    return np.asarray(table[:, None, :3] + x[..., None] * table[:, None, 3:6] + y[..., None] * table[:, None, 6:9])
+
+
+def _perimeters(points: Floats) -> Floats:
+    """(K,) ways round (K, A, 3) rings: the mean width of a convex ring is its perimeter over pi (Cauchy)."""
+    return np.asarray(np.linalg.norm(np.roll(points, -1, axis=1) - points, axis=2).sum(axis=1))
 
 
 def _volume(vertices: Floats, triangles: NDArray[np.int32]) -> float:
