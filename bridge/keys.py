@@ -21,6 +21,15 @@ def chunk(value: str) -> str:
     return name(re.sub(r"[^A-Za-z0-9_-]", "-", value)[:64])
 
 
+def env(run: str, episode: str) -> str:
+    """What all keys of one running episode begin with."""
+    return f"cosim/{name(run)}/env/{name(episode)}"
+
+
 def director(run: str, env: str) -> str:
     """Where the simulator of one environment asks for the event pedestrians of a tick."""
     return f"cosim/{name(run)}/env/{name(env)}/director"
+
+
+EVERY_STATUS = "cosim/*/env/*/status"
+"""Asked, every running episode answers."""

@@ -48,6 +48,7 @@ class Session:
     def __init__(self, session: zenoh.Session) -> None:
         self._session = session
         self._queryables: list[zenoh.Queryable[None]] = []
+        self._subscribers: list[zenoh.Subscriber[None]] = []
 
     @classmethod
     def hub(cls, listen: str) -> Session:
@@ -59,12 +60,15 @@ class Session:
         """A session that connects to a hub; it opens no port of its own."""
         return cls(_open(_config("client", [], [connect]), f"no hub answers at {connect}"))
 
-    def serve(self, key: str, handler: Handler) -> None:
-        """Answer queries on `key` with `handler(payload)`; its exceptions become error replies."""
+    def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
+        """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
+
+        found: queries on key expressions that include `key` are answered too.
+        """
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                if str(query.key_expr) != key:
+                if str(query.key_expr) != key and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
                     query.reply_err(f"ask for exactly '{key}', not '{query.key_expr}'".encode())
                     return
                 payload = query.payload.to_bytes() if query.payload is not None else b""
@@ -74,6 +78,23 @@ class Session:
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
+
+    def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
+        """Everybody's replies to one empty query on a key expression, by their keys; errors are left out."""
+        replies = self._session.get(key, timeout=timeout_s)
+        return {str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None}
+
+    def tell(self, key: str, payload: bytes) -> None:
+        """Publish; whoever is slow to listen misses it."""
+        self._session.put(key, payload, congestion_control=zenoh.CongestionControl.DROP)
+
+    def listen(self, key: str, handler: Callable[[str, bytes], None]) -> None:
+        """Call `handler(key, payload)` for whatever is published on a key expression."""
+
+        def heard(sample: zenoh.Sample) -> None:
+            handler(str(sample.key_expr), sample.payload.to_bytes())
+
+        self._subscribers.append(self._session.declare_subscriber(key, heard))
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """The reply to one query. Asks again while nobody answers, until `timeout_s` is over.
@@ -99,6 +120,9 @@ class Session:
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
             self._queryables.clear()
+            for subscriber in self._subscribers:
+                subscriber.undeclare()  # type: ignore[no-untyped-call]
+            self._subscribers.clear()
             self._session.close()  # type: ignore[no-untyped-call]
 
     def __enter__(self) -> Self:

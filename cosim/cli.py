@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -26,6 +27,7 @@ from rich.table import Column, Table
 
 from cosim.cli_city import city_app
 from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
+from cosim.cli_live import checked_endpoint, inject, listen, replay
 from cosim.cli_map import map_app
 from cosim.errors import CosimError, UsageError
 
@@ -42,6 +44,13 @@ app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n
     look
 )
 app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
+app.command(
+    epilog="Examples:  \n"
+    '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
+    "`cosim inject @anna.json --env mine/lh-011-00`"
+)(inject)
+app.command(epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
+app.command(epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
 out = Console()
 err = Console(stderr=True)
 
@@ -81,8 +90,14 @@ def run(
     ] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
+    live: Annotated[
+        str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
+    ] = None,
 ) -> None:
     """Run a suite with a policy and print its table."""
+    from bridge import keys
+    from bridge.session import Session
+    from cosim.injection import Live
     from cosim.policies.load import load_policy
     from cosim.record import NO_RENDERER
     from cosim.runfolder import RunFolder, RunSpec
@@ -118,8 +133,9 @@ def run(
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
+    on_air = None if live is None else Live(endpoint=checked_endpoint(live), run=keys.chunk(path.name))
     held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
-    with held:
+    with held, nullcontext() if on_air is None else Session.hub(on_air.endpoint):
         done = held.finished()
         todo = [s for s in picked if s.id not in done]
         if done:
@@ -130,8 +146,16 @@ def run(
             with board.bars:
                 tell = board.tell
                 run_all(
-                    held, todo, policy, manifest, jobs=jobs, tell=tell, frames_every_s=frames, camera=drawn_by
-                )  # fmt: skip
+                    held,
+                    todo,
+                    policy,
+                    manifest,
+                    jobs=jobs,
+                    tell=tell,
+                    frames_every_s=frames,
+                    camera=drawn_by,
+                    live=on_air,
+                )
         except KeyboardInterrupt:
             finished = len(held.finished())
             again = " ".join(a for a in sys.argv[1:] if a != "--resume")

@@ -70,12 +70,8 @@ def film(
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Film an episode of a run: from behind the robot, with its own view, the map, events and failures."""
-    from cosim.runfolder import read_records
     from scenarios.film import Cut, film
 
-    records = {record.scenario for record in read_records(folder)}
-    if episode not in records:
-        raise unknown(f"finished episode in {folder}", episode, records)
     bars = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=err
     )

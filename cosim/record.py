@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cosim.errors import RunError
 from cosim.geometry import Floats
+from cosim.injection import Injected
 from cosim.ports import Manifest
 from cosim.referee import Failure, Verdict
 from cosim.scenario import Scenario, content_hash
@@ -102,6 +103,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
+    injections: pedestrians that came in from outside; with them the episode can be replayed.
     invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
     """
 
@@ -123,6 +125,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     measures: dict[str, float | None] = {}
     failures: tuple[Failure, ...] = ()
     events: tuple[TriggeredEvent, ...] = ()
+    injections: tuple[Injected, ...] = ()
     schema: int = SCHEMA
     clock: dict[str, float] = {}
 

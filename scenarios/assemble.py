@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import shapely
@@ -17,6 +17,7 @@ from bridge.director import RemoteDirector, serve_director
 from bridge.session import Session
 from cosim.clock import Clock
 from cosim.control import Limits
+from cosim.injection import Injected
 from cosim.loop import Parts
 from cosim.ports import CameraSpec, Director, Eyes, Policy
 from cosim.record import NO_RENDERER
@@ -27,6 +28,7 @@ from physics.furniture import Prop, footprints
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
+from scenarios.guests import Guests
 from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.mapstore import map_net, read_map
@@ -36,21 +38,31 @@ CORRIDOR_M = 40.0
 """The walkable area is judged this far around the route; beyond it everything is out of lane."""
 
 
+FRONTAGE_M = 2.0
+"""Beside a sidewalk there is room for this much."""
+
+
 @dataclass(frozen=True, slots=True)
 class Stage:
     """A scenario ready to run. area: where the robot may be, for the referee. renderer: what draws for the policy.
-    eyes: makes further cameras."""
+    eyes: makes further cameras. guests: takes injected pedestrians in."""
 
     parts: Parts
     area: WalkableArea
     clock: Clock
     renderer: str
     eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
+    guests: Guests
 
 
 @contextmanager
-def staged(scenario: Scenario, policy: Policy, choice: CameraChoice = "auto") -> Iterator[Stage]:
-    """Start every engine of a scenario; all are closed at the end, whatever happened. choice: what draws pictures."""
+def staged(
+    scenario: Scenario, policy: Policy, choice: CameraChoice = "auto", script: Sequence[Injected] = ()
+) -> Iterator[Stage]:
+    """Start every engine of a scenario; all are closed at the end, whatever happened.
+
+    choice: what draws pictures. script: pedestrians that were injected into the episode that is replayed.
+    """
     manifest = policy.manifest
     clock = Clock.for_rate(manifest.rate_hz)
     net_path, street_map = place(scenario.place)
@@ -78,8 +90,14 @@ def staged(scenario: Scenario, policy: Policy, choice: CameraChoice = "auto") ->
         footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
         free = shapely.buffer(footing, -half_width_m)
         shapely.prepare(free)
-        parts = Parts(world, crowd, director, policy, camera, Limits(), free)
-        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes)
+        guests = Guests(director, clock.tick_ms, partial(on_map, street_map), script)
+        parts = Parts(world, crowd, guests, policy, camera, Limits(), free)
+        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests)
+
+
+def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
+    """Whether somebody may be there: on a street, or within FRONTAGE_M of one."""
+    return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
 
 
 def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:

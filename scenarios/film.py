@@ -19,18 +19,19 @@ from cosim.errors import RunError
 from cosim.geometry import Floats
 from cosim.policies.replay import Replay
 from cosim.ports import CameraSpec, Eyes
-from cosim.record import Log, Record, begun
+from cosim.record import Record, begun
 from cosim.referee import Verdict
 from cosim.report import hud
 from cosim.report.above import Image
 from cosim.report.minimap import Minimap
 from cosim.report.video import Video
-from cosim.scenario import Scenario, read_suite
+from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.step import Step
 from physics.cameras import CameraChoice
 from scenarios.assemble import place, staged
 from scenarios.look import behind
+from scenarios.replay import check, recorded
 from scenarios.run import drive
 
 EASE_S: Final = 0.5
@@ -56,7 +57,8 @@ Tell = Callable[[int, int], None]
 
 def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> None:
     """Write the film of a finished episode. Raises RunError when there is none, or when the replay differs."""
-    scenario, record, log = _recorded(folder, scenario_id)
+    told = recorded(folder, scenario_id)
+    scenario, record, log = told
     last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
     if not 0.0 <= cut.from_s < Clock().time_s(last):
         raise RunError(
@@ -70,25 +72,15 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
     driver = Replay(log.command)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        stage = stack.enter_context(staged(scenario, driver, cut.camera))
+        stage = stack.enter_context(staged(scenario, driver, cut.camera, script=record.injections))
         camera = stack.enter_context(stage.eyes(ROBOT_EYE))
         reel = _Reel(scenario, record, Minimap(street_map, scenario), camera, video, cut, last, tell)
         again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)
-    if again.state_hash != record.state_hash:
+    try:
+        check(folder, told, again.state_hash)
+    except RunError:
         output.unlink(missing_ok=True)
-        raise RunError(
-            f"{folder}: '{scenario_id}' was not the same when it was replayed ({again.state_hash[:16]}, recorded "
-            f"{record.state_hash[:16]}): other versions? It was made with {record.versions}"
-        )
-
-
-def _recorded(folder: Path, scenario_id: str) -> tuple[Scenario, Record, Log]:
-    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
-    episode = folder / "episodes" / scenario_id
-    record = Record.load(episode / "record.json")
-    if record.status != "done":
-        raise RunError(f"{folder}: '{scenario_id}' {record.status}: there is nothing to film")
-    return scenarios[scenario_id], record, Log.load(episode / "trajectory.npz")
+        raise
 
 
 class _Reel:

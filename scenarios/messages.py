@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from cosim.injection import Live
 from cosim.record import Status
 from cosim.scenario import Scenario
 
@@ -21,6 +22,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     folder: str
     frames_every_s: float = 0.0
     camera: Literal["gl", "bullet"] = "bullet"
+    live: Live | None = None
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):

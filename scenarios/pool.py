@@ -20,6 +20,7 @@ from pathlib import Path
 import msgspec
 
 from cosim.errors import RunError
+from cosim.injection import Live
 from cosim.ports import Manifest
 from cosim.record import begun
 from cosim.runfolder import RunFolder
@@ -58,9 +59,10 @@ def run_all(
     tell: Tell,
     frames_every_s: float = 0.0,
     camera: CameraName = "bullet",
+    live: Live | None = None,
 ) -> None:
     """Run scenarios, `jobs` at a time, adding each record to the folder as it ends."""
-    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera)
+    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera, live)
     waiting = deque(scenarios)
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
@@ -88,9 +90,10 @@ class _Pool:
         tell: Tell,
         frames_every_s: float,
         camera: CameraName,
+        live: Live | None,
     ) -> None:
         self._folder, self._policy, self._manifest = folder, policy, manifest
-        self._tell, self._frames_every_s, self._camera = tell, frames_every_s, camera
+        self._tell, self._frames_every_s, self._camera, self._live = tell, frames_every_s, camera, live
         self._workers: list[_Worker] = []
         self._started = 0
 
@@ -106,7 +109,8 @@ class _Pool:
         (Path(target) / "record.json").unlink(missing_ok=True)
         try:
             suite_hash = self._folder.spec.suite_hash
-            idle.pipe.send_bytes(encode(Job(scenario, suite_hash, target, self._frames_every_s, self._camera)))
+            job = Job(scenario, suite_hash, target, self._frames_every_s, self._camera, self._live)
+            idle.pipe.send_bytes(encode(job))
         except BrokenPipeError:
             idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out
 

@@ -5,12 +5,14 @@ from __future__ import annotations
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
 import msgspec
 
 from cosim.errors import CosimError
+from cosim.injection import Live
 from cosim.loop import steps
 from cosim.metrics import Episode, measure
 from cosim.ports import Policy
@@ -21,6 +23,7 @@ from cosim.step import Step
 from cosim.witness import Witness, unwitnessed
 from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
+from scenarios.on_air import OnAir
 
 Watch = Callable[[Step, Verdict], None]
 
@@ -41,15 +44,23 @@ def episode(
     suite_hash: str = "",
     camera: CameraChoice = "auto",
     watch: Watch | None = None,
+    live: Live | None = None,
 ) -> Outcome:
-    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`."""
+    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
+
+    live: where it is on the air meanwhile.
+    """
     began = time.perf_counter()
     record = begun(scenario, policy.manifest, suite_hash)
     try:
         with staged(scenario, policy, camera) as stage:
             record = replaced(record, renderer=stage.renderer)
             first_tick_s = time.perf_counter() - began
-            record, log = drive(record, scenario, stage, watch)
+            with ExitStack() as air:
+                watches = [watch] if watch is not None else []
+                if live is not None:
+                    watches.append(air.enter_context(OnAir(live, scenario, stage.guests)).tell)
+                record, log = drive(record, scenario, stage, *watches)
     except Exception as error:  # noqa: BLE001  the one place where a failing episode is turned into its record
         reason = str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
         return Outcome(replaced(record, status="crashed", reason=reason), None, traceback.format_exc())
@@ -58,7 +69,7 @@ def episode(
     return Outcome(replaced(record, clock=clock), log)
 
 
-def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None) -> tuple[Record, Log]:
+def drive(record: Record, scenario: Scenario, stage: Stage, *watches: Watch) -> tuple[Record, Log]:
     """The episode itself, once every engine runs."""
     referee = Referee(scenario, stage.area, stage.parts.world.footprint_m, stage.clock)
     recorder = Recorder(stage.clock.tick_s)
@@ -75,7 +86,7 @@ def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None)
             failures.append(verdict.failure)
         if verdict.red_light_entry is not None:
             red_lights.append(verdict.red_light_entry)
-        if watch is not None:
+        for watch in watches:
             watch(step, verdict)
         if verdict.ended is not None:
             break
@@ -96,6 +107,7 @@ def drive(record: Record, scenario: Scenario, stage: Stage, watch: Watch | None)
         measures=measure(seen),
         failures=tuple(failures),
         events=events,
+        injections=stage.guests.log,
     )
     return done, log
 

@@ -48,7 +48,9 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
         except EOFError:
             return
         watch = watcher(job, pipe)
-        outcome = episode(job.scenario, driver, suite_hash=job.suite_hash, camera=job.camera, watch=watch)
+        outcome = episode(
+            job.scenario, driver, suite_hash=job.suite_hash, camera=job.camera, watch=watch, live=job.live
+        )
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
             driver = load_policy(policy)

@@ -1,0 +1,115 @@
+"""The command line of running episodes: `cosim inject`, `cosim listen`; and `cosim replay` of finished ones."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+
+from cosim.errors import EngineError, UsageError, unknown
+
+out = Console()
+err = Console(stderr=True)
+
+DEFAULT = "tcp/127.0.0.1:7447"
+SEARCH_S = 1.0
+
+Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
+Env = Annotated[str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")]
+
+
+def inject(
+    message: Annotated[str, typer.Argument(help="The pedestrian as JSON, @FILE, or - for standard input.")],
+    connect: Connect = DEFAULT,
+    env: Env = None,
+) -> None:
+    """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 1: refused."""
+    from bridge.live import inject as send
+    from bridge.session import Session
+
+    payload = _payload(message)
+    with Session.client(connect) as session:
+        below = _chosen(session, env)
+        ack = send(session, f"{below}/inject", payload)
+    if ack.status == "refused":
+        err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
+        raise typer.Exit(1)
+    out.print(f"'{ack.id}' enters at tick {ack.tick}, {ack.time_s:.2f} s", highlight=False)
+
+
+def listen(
+    topic: Annotated[str, typer.Argument(help="clock, robot, crowd, signals or events.")] = "events",
+    connect: Connect = DEFAULT,
+    env: Env = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, help="How long; by default until stopped.")] = None,
+) -> None:
+    """Print what a running episode tells: a line of JSON each time. For `events` what happened before comes first."""
+    from bridge.session import Session
+
+    topics = ("clock", "robot", "crowd", "signals", "events")
+    if topic not in topics:
+        raise unknown("topic", topic, topics)
+    with Session.client(connect) as session:
+        below = _chosen(session, env)
+        if topic == "events":
+            print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
+        session.listen(f"{below}/{topic}", lambda _, payload: print(payload.decode(), flush=True))
+        try:
+            time.sleep(seconds if seconds is not None else 1e9)
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+
+
+def replay(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+) -> None:
+    """Run a finished episode again from its record, injections included, and compare the state hash."""
+    from scenarios.replay import check, recorded, replayed
+
+    with err.status(f"replaying {episode} ..."):
+        told = recorded(folder, episode)
+        again = replayed(told)
+    check(folder, told, again)
+    out.print(f"{episode}: state hash {again}, as recorded", highlight=False)
+
+
+def _payload(message: str) -> bytes:
+    if message == "-":
+        return sys.stdin.buffer.read()
+    if message.startswith("@"):
+        try:
+            return Path(message[1:]).read_bytes()
+        except OSError as error:
+            raise UsageError(f"{message[1:]}: cannot be read: {error.strerror}") from error
+    return message.encode()
+
+
+def _chosen(session: object, env: str | None) -> str:
+    """What the keys of the episode that is meant begin with. Raises UsageError when that is not clear."""
+    from bridge import keys
+    from bridge.session import Session
+
+    assert isinstance(session, Session)
+    found = sorted(key.removesuffix("/status") for key in session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S))
+    names = {"/".join(below.split("/")[1::2]): below for below in found}
+    if env is not None:
+        if env not in names:
+            raise unknown("running episode", env, names)
+        return names[env]
+    if not names:
+        raise EngineError("no episode is running there: start one with `cosim run ... --live ENDPOINT`")
+    if len(names) > 1:
+        raise UsageError(f"several episodes are running: choose one with --env: {', '.join(names)}")
+    return found[0]
+
+
+def checked_endpoint(endpoint: str) -> str:
+    """An endpoint that can be listened at, as zenoh writes it. Raises UsageError."""
+    if not endpoint.startswith(("tcp/", "unixsock-stream/", "tls/", "udp/", "quic/")):
+        raise UsageError(f"--live '{endpoint}': write it as PROTOCOL/ADDRESS, like {DEFAULT}")
+    return endpoint

@@ -1,0 +1,63 @@
+"""A guest: an injected pedestrian that walks its path, stays at the end for its time, and is gone."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import msgspec
+
+from cosim.events import Actor, EventQuery, Walker
+from cosim.injection import Injected, Injection
+from scenarios.behaviors.walking import turned, walked_to
+
+
+class Guest(NamedTuple):
+    """Where an injected pedestrian stands. leg: the point of its path it walks to; arrived_tick: at the last one."""
+
+    injection: Injection
+    walker: Walker
+    leg: int = 1
+    arrived_tick: int | None = None
+    moved_m: float = 0.0
+
+
+def arriving(injected: Injected) -> Guest:
+    """The guest as it appears: at the first point, facing the second."""
+    injection = injected.injection
+    (x, y), *others = injection.path
+    facing = injection.heading_rad or 0.0
+    if others:
+        facing = math.atan2(others[0][1] - y, others[0][0] - x)
+    return Guest(injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick)
+
+
+def advanced(guest: Guest, query: EventQuery) -> Guest | None:
+    """One tick on; None once it is gone. It steps round the robot."""
+    injection, walker = guest.injection, guest.walker
+    if guest.arrived_tick is not None:
+        if (query.tick - guest.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
+            return None
+        if injection.heading_rad is not None:
+            heading = turned(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
+            walker = msgspec.structs.replace(walker, heading_rad=heading)
+        return guest._replace(walker=walker, moved_m=0.0)
+    goal = injection.path[guest.leg]
+    after = walked_to(walker, *goal, injection.speed_mps, query)
+    moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
+    leg = guest.leg + ((after.x_m, after.y_m) == goal)
+    arrived = query.tick if leg == len(injection.path) else None
+    return guest._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
+
+
+def actor_of(guest: Guest, tick_ms: int) -> Actor:
+    """The guest as the world shows it."""
+    walker = guest.walker
+    return Actor(
+        id=f"ei-{guest.injection.id}",
+        x_m=walker.x_m,
+        y_m=walker.y_m,
+        heading_rad=walker.heading_rad,
+        speed_mps=guest.moved_m * 1000 / tick_ms,
+        doing=guest.injection.doing if guest.moved_m < 1e-6 else "walk",
+    )

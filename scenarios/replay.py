@@ -1,0 +1,53 @@
+"""A recorded episode run again: the same commands, the same injections, the same state hash."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from cosim.errors import RunError, unknown
+from cosim.policies.replay import Replay
+from cosim.record import Log, Record, begun
+from cosim.runfolder import read_records
+from cosim.scenario import Scenario, read_suite
+from scenarios.assemble import staged
+from scenarios.run import Watch, drive
+
+
+class Recorded(NamedTuple):
+    """All that a run folder holds of an episode."""
+
+    scenario: Scenario
+    record: Record
+    log: Log
+
+
+def recorded(folder: Path, scenario_id: str) -> Recorded:
+    """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
+    records = {record.scenario for record in read_records(folder)}
+    if scenario_id not in records:
+        raise unknown(f"finished episode in {folder}", scenario_id, records)
+    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
+    episode = folder / "episodes" / scenario_id
+    record = Record.load(episode / "record.json")
+    if record.status == "crashed":
+        raise RunError(f"{folder}: '{scenario_id}' crashed: there is nothing to run again")
+    return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
+
+
+def replayed(told: Recorded, *watches: Watch) -> str:
+    """Run it again; the state hash that comes out."""
+    driver = Replay(told.log.command)
+    with staged(told.scenario, driver, script=told.record.injections) as stage:
+        record, _ = drive(begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, *watches)
+    return record.state_hash
+
+
+def check(folder: Path, told: Recorded, state_hash: str) -> None:
+    """Raises RunError when a replay came out otherwise than recorded."""
+    record = told.record
+    if state_hash != record.state_hash:
+        raise RunError(
+            f"{folder}: '{record.scenario}' was not the same when it was replayed ({state_hash[:16]}, recorded "
+            f"{record.state_hash[:16]}): other versions? It was made with {record.versions}"
+        )
