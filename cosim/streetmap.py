@@ -220,7 +220,11 @@ class StreetMap:
 def union_closed(polygons: Sequence[shapely.Geometry]) -> Polygon | MultiPolygon:
     """Union of polygons, with gaps up to 2 x SEAM_M between them closed."""
     grown = shapely.buffer(np.asarray(polygons, dtype=object), SEAM_M, join_style="mitre")
-    return shapely.buffer(shapely.union_all(grown), -SEAM_M, join_style="mitre")
+    closed = shapely.buffer(shapely.union_all(grown), -SEAM_M, join_style="mitre")
+    # Slivers of foreign nets can make the mitred outline cross itself.
+    if closed.is_valid:
+        return closed
+    return shapely.make_valid(closed, method="structure", keep_collapsed=False)  # type: ignore[return-value]
 
 
 class WalkableArea:

@@ -10,7 +10,7 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 
 from cosim.errors import SpecError
-from cosim.geometry import Polyline
+from cosim.geometry import Floats, Polyline
 from cosim.scenario import Barrier
 from cosim.streetmap import Port, StreetMap, union_closed
 
@@ -21,6 +21,9 @@ OVERHANG_M = 0.12
 THICKNESS_M = 0.16
 SEAM_HOLE_M2 = 0.25
 """Smaller holes in the walkable area are seams of the net, not ways round something."""
+
+MOUTH_M = 4.0
+"""How far before and behind a strip's end the edge of a slanting corner is looked for."""
 
 REACH_M = 30.0
 """The walkable area is examined this far around the way; what can be reached must end before."""
@@ -39,8 +42,10 @@ def corner_of(street_map: StreetMap, port: Port) -> str:
     return street_map.strips[port.strip].corners[port.end] or ""
 
 
-def barrier_at(street_map: StreetMap, port: Port) -> Barrier:
-    """The barrier that closes a port."""
+def barrier_at(street_map: StreetMap, port: Port, *, slanting: bool = False) -> Barrier:
+    """The barrier that closes a port: square to its strip, or slanting where the strip's mouth does."""
+    if slanting:
+        return _slanting_barrier(street_map, port)
     strip = street_map.strips[port.strip]
     line = Polyline(strip.line[:, :2] if port.end == 0 else strip.line[::-1, :2])
     into_m = min(INTO_STRIP_M, line.length_m / 2) if strip.kind == "sidewalk" else -THICKNESS_M / 2 + 0.02
@@ -55,6 +60,40 @@ def barrier_at(street_map: StreetMap, port: Port) -> Barrier:
         end=port.end,
         thickness_m=THICKNESS_M,
     )
+
+
+def _slanting_barrier(street_map: StreetMap, port: Port) -> Barrier:
+    strip = street_map.strips[port.strip]
+    line = Polyline(strip.line[:, :2] if port.end == 0 else strip.line[::-1, :2])
+    x_m, y_m, heading_rad = line.at(0.0)
+    along = np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    left, right = (np.array([x_m, y_m]) + side for side in np.outer((0.5, -0.5), strip.width_m * along[::-1] * (-1, 1)))
+    into_m = min(INTO_STRIP_M, line.length_m / 2) if strip.kind == "sidewalk" else 0.0
+    corner = street_map.corners.get(corner_of(street_map, port))
+    if corner is not None:
+        reach_m = min(MOUTH_M, line.length_m / 2)
+        left, right = (mouth(edge, along, reach_m, corner.polygon) for edge in (left, right))
+    across = left - right
+    x_m, y_m = ((left + right) / 2 + into_m * along).tolist()
+    return Barrier(
+        x_m=round(x_m, 3),
+        y_m=round(y_m, 3),
+        heading_rad=round(math.atan2(-across[0], across[1]), 5),
+        length_m=round(float(np.hypot(*across)) + 2 * OVERHANG_M, 3),
+        strip=port.strip,
+        end=port.end,
+        thickness_m=THICKNESS_M,
+    )
+
+
+def mouth(end: Floats, along: Floats, reach_m: float, corner: Polygon | MultiPolygon) -> Floats:
+    """Where an edge of a strip meets a corner, (2,) metres; the edge's own end where it does not.
+
+    end: (2,) of the edge at the port. along: (2,) unit vector from there into the strip. reach_m: how far to look.
+    """
+    inside = end + reach_m * along
+    met = LineString([inside, end - MOUTH_M * along]).intersection(corner)
+    return end if met.is_empty else inside - met.distance(Point(inside)) * along
 
 
 def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:

@@ -10,7 +10,7 @@ import numpy as np
 from cosim.errors import CosimError, MapError, SpecError
 from cosim.events import Event, Kind
 from cosim.geometry import Polyline
-from cosim.scenario import CrowdSpec, Place, RouteCrossing, Scenario
+from cosim.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
@@ -68,8 +68,7 @@ def _draw(
     route = Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 3))
     if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
         raise SpecError("length of the line does not fit")
-    barriers = tuple(barrier_at(street_map, port) for port in branches(street_map, way))
-    prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+    barriers = _barriers(street_map, route, way)
     start, goal = route.at(0.0), route.at(route.length_m)
     return Scenario(
         id=scenario_id,
@@ -85,6 +84,18 @@ def _draw(
         crowd=CrowdSpec(),
         time_limit_s=max(300.0, route.length_m / 0.2),
     )
+
+
+def _barriers(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+    """Barriers that leave one path, square to their strips if possible. Raises SpecError when there are none."""
+    ports = branches(street_map, way)
+    barriers = tuple(barrier_at(street_map, port) for port in ports)
+    try:
+        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+    except SpecError:
+        barriers = tuple(barrier_at(street_map, port, slanting=True) for port in ports)
+        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+    return barriers
 
 
 def draw_way(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 import shapely
-from shapely.geometry import LineString, Point, box
+from shapely.geometry import LineString, Point, Polygon, box
 
 from cosim.clock import Clock
 from cosim.control import Limits
@@ -17,7 +18,7 @@ from cosim.errors import SpecError
 from cosim.geometry import Polyline
 from cosim.policies import POLICIES
 from cosim.ports import Privileged
-from cosim.scenario import City, CityMap, Scenario, content_hash, read_suite, write_suite
+from cosim.scenario import Barrier, City, CityMap, Scenario, content_hash, read_suite, write_suite
 from cosim.state import NO_VEHICLES, NOBODY, RobotState
 from cosim.streetmap import Corner, Port, StreetMap, Strip, WalkableArea
 from cosim.walks import WalkGraph
@@ -171,6 +172,23 @@ def test_a_fence_closes_its_whole_strip() -> None:
         far = Point(street_map.strips[name].line[-1] * 0.9)
         part = next(p for p in shapely.get_parts(free) if p.covers(far))
         assert not part.covers(Point(0, 0))
+
+
+def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() -> None:
+    """Where a corner reaches round the end of a crossing a square fence leaves a way past it, a slanting one none."""
+    street_map = cross_map()
+    slanting = Corner("middle", Polygon([(-2, -2), (2, -2), (2, 6), (-2, 2)]), street_map.corners["middle"].ports)
+    north = dataclasses.replace(street_map.strips["north"], kind="crossing")
+    strips = {**street_map.strips, "north": north}
+    street_map = StreetMap("slant", street_map.bounds, strips, {"middle": slanting}, {}, {})
+    far = Point(0, 40)
+
+    def reached(fence: Barrier) -> bool:
+        free = fenced(street_map.walkable, [fence])
+        return any(part.covers(far) and part.covers(Point(0, -1)) for part in shapely.get_parts(free))
+
+    assert reached(barrier_at(street_map, Port("north", 0)))
+    assert not reached(barrier_at(street_map, Port("north", 0), slanting=True))
 
 
 @pytest.mark.parametrize("name", POLICIES)
