@@ -39,6 +39,8 @@ _CELL_M: Final = 2.5
 """Side of the cells in which things look for others: no two that touch are farther apart."""
 FAR_M: Final = 100.0
 """What is farther from every walkway is left out."""
+IN_ZONE_DEG: Final = 10.0
+"""What is farther from the middle of the net's UTM zone is no part of the map."""
 LEFT_SHARE: Final = 0.5
 LEFT_M2: Final = 6.0
 """A building stays when this much of it is left after the streets have been cut out."""
@@ -55,9 +57,8 @@ def fitted(found: Found, location: Mapping[str, str], street_map: StreetMap) -> 
     if zone is None:
         return (), [f"{len(found.things)} buildings and things left out: the net has no UTM projection"]
     offset = np.array([float(v) for v in location["netOffset"].split(",")])
-    mapped = [
-        thing._replace(rings=tuple(utm_xy(ring, *zone) + offset for ring in thing.rings)) for thing in found.things
-    ]
+    around = [thing for thing in found.things if _in_zone(thing, zone[0])]
+    mapped = [thing._replace(rings=tuple(utm_xy(ring, *zone) + offset for ring in thing.rings)) for thing in around]
     near = _near(mapped, street_map)
     streets = _Streets(street_map)
     buildings, told = _cut_back([thing for thing in near if thing.kind == "building"], streets)
@@ -69,6 +70,12 @@ def fitted(found: Found, location: Mapping[str, str], street_map: StreetMap) -> 
     if left_out:
         changes.append(f"left out: {', '.join(left_out)}")
     return (*buildings, *standing), [*changes, *told, *more]
+
+
+def _in_zone(thing: Mapped, zone: int) -> bool:
+    """Whether a thing is so near to the zone's middle that the projection holds for it."""
+    east = np.remainder(thing.rings[0][:, 0] - (6.0 * zone - 183.0) + 180.0, 360.0) - 180.0
+    return bool((np.abs(east) < IN_ZONE_DEG).all())
 
 
 def _near(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
@@ -157,8 +164,11 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
     cut = dropped = 0
     for thing in mapped:
         whole = Polygon(thing.rings[0], thing.rings[1:])
-        parts = [whole] if whole.is_valid else []
-        taken = streets.under(shapely.buffer(whole, WALL_M)) if parts else Polygon()
+        if not whole.is_valid:
+            dropped += 1  # valid in degrees, and too thin for metres
+            continue
+        parts = [whole]
+        taken = streets.under(shapely.buffer(whole, WALL_M))
         if not shapely.is_empty(taken):
             parts = _without(whole, taken)
             left = sum(part.area for part in parts) > LEFT_SHARE * whole.area
@@ -173,7 +183,7 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
     if cut:
         told.append(f"buildings cut back where they reached into streets (what is walked on wins): {cut}")
     if dropped:
-        told.append(f"buildings left out that lay mostly on streets: {dropped}")
+        told.append(f"buildings left out that lay mostly on streets or are none: {dropped}")
     return found, told
 
 

@@ -29,9 +29,9 @@ from physics.placement import standing
 from physics.tiles import TILE_M, keys_within
 from physics.world import BulletWorld
 from sumo_nets.featurefile import NAME, read_features, with_features, write_features
-from sumo_nets.featurefit import EXTENT_M, WALL_M
+from sumo_nets.featurefit import EXTENT_M, WALL_M, fitted
 from sumo_nets.mapstore import about_map, import_map, map_hash, map_net, read_map
-from sumo_nets.osmfeatures import HIGHEST_M, LOWEST_M, Mapped, building_height_m, osm_features
+from sumo_nets.osmfeatures import HIGHEST_M, LOWEST_M, Found, Mapped, building_height_m, osm_features
 from sumo_nets.osmfile import MapFile
 from sumo_nets.utm import utm_xy, utm_zone
 
@@ -155,7 +155,7 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     told = " | ".join(changes)
     assert "taken from the map: 2 x building, 3 x tree" in told
     assert "buildings cut back where they reached into streets (what is walked on wins): 1" in told
-    assert "buildings left out that lay mostly on streets: 1" in told
+    assert "buildings left out that lay mostly on streets or are none: 1" in told
     assert "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1" in told
     assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in told
     lanes = [p.polygon for p in street_map.lanes.values() if p.kind == "road"]
@@ -173,6 +173,17 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     assert min(shapely.distance(ground, roads) for ground in footprints(props)) > 0.0
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
     assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, standing(street_map, 1)).values())
+
+
+@pytest.mark.engine
+def test_what_lies_on_the_other_side_of_the_earth_is_left_out(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """Points anywhere on earth, where the projection has no value too, come to nothing."""
+    location = {"projParameter": "+proj=utm +zone=33 +datum=WGS84", "netOffset": "-391000.0,-5817000.0"}
+    spots = [(lon, lat) for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0) for lat in (-85.0, 0.0, 52.5, 85.0)]
+    things = [Mapped("tree", (np.array([spot]),), 0.0, None) for spot in spots]
+    square = np.array([(0.0, 0.0), (1e-3, 0.0), (1e-3, 1e-3), (0.0, 1e-3), (0.0, 0.0)])
+    things += [Mapped("building", (square + spot,), 9.0, None) for spot in spots]
+    assert fitted(Found(tuple(things), {}), location, drawn[0]) == ((), [])
 
 
 @pytest.mark.engine
