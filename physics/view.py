@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final
 
 import numpy as np
@@ -45,7 +46,7 @@ class View:
         return np.flatnonzero((wide < margin_m) & (ahead > -margin_m) & (np.hypot(ahead, aside) < VISIBLE_M))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Shot:
     """A picture to be taken: (3,) eye_m and target_m; width and height in pixels; vertical field of view."""
 
@@ -63,7 +64,7 @@ class Shot:
         ahead = self.target_m - self.eye_m
         return math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
 
-    @property
+    @cached_property
     def view(self) -> View:
         ahead = self.target_m - self.eye_m
         half_up = math.radians(0.5 * self.fov_deg)
@@ -71,16 +72,14 @@ class Shot:
         half_wide = math.atan(math.tan(half_up) * self.size[0] / self.size[1] / lowest)
         return View(self.eye_m, math.atan2(ahead[1], ahead[0]), half_wide)
 
-    @property
+    @cached_property
     def axes(self) -> Floats:
         """(3, 3) unit vectors right, up in the picture, ahead. A view straight down has north above."""
-        ahead = self.target_m - self.eye_m
-        ahead = ahead / np.linalg.norm(ahead)
-        right = np.cross(ahead, (0.0, 0.0, 1.0))
-        if np.linalg.norm(right) < 1e-6:
-            right = np.array([1.0, 0.0, 0.0])
-        right /= np.linalg.norm(right)
-        return np.stack([right, np.cross(right, ahead), ahead])
+        x, y, z = (self.target_m - self.eye_m).tolist()
+        flat, long = math.hypot(x, y), math.hypot(x, y, z)
+        x, y, z = x / long, y / long, z / long
+        rx, ry = (y * long / flat, -x * long / flat) if flat > 1e-6 * long else (1.0, 0.0)
+        return np.array([[rx, ry, 0.0], [ry * z, -rx * z, rx * y - ry * x], [x, y, z]])
 
 
 def check_size(width: int, height: int, fov_deg: float) -> None:

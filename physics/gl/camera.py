@@ -22,7 +22,7 @@ from physics.gl.context import context
 from physics.gl.lighting import lighting_of
 from physics.gl.scene import Scene
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
-from physics.gl.shadows import ShadowMaps, middle_of, shadow_matrix
+from physics.gl.shadows import ShadowMaps, middle_of
 from physics.gl.targets import Target
 from physics.lens import drawn, through
 from physics.sky import sky_of
@@ -104,7 +104,7 @@ class GlCamera:
             from_sun = np.eye(4)
             if self._shadows is not None:
                 middle = middle_of(taken.eye_m)
-                from_sun = shadow_matrix(middle, anchor, self._light.to_sun)
+                from_sun = self._shadows.matrix(middle, anchor, self._light)
                 self._block.write(from_sun, from_sun, taken, anchor, self._light)
                 self._shadows.draw(middle, anchor, self._light, self._scene.draw)
                 self._shadows.bind()

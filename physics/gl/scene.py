@@ -26,13 +26,15 @@ from physics.gl.robot_body import robot_parts
 from physics.gl.shading import Stage
 from physics.gl.shadows import REACH_M, STEP_M, middle_of
 from physics.gl.surfaces import surfaces
-from physics.gl.tiles import TileBuffers, TileShaders, ground_parts, paint_parts
-from physics.gl.walls import WallBuffers, WallShaders
+from physics.gl.tiles import TileBuffers, ground_parts, paint_parts, tile_shaders
+from physics.gl.walls import WallBuffers, wall_shaders
 from physics.ground import Ground
 from physics.robots import RobotModel
 from physics.tiles import Key, distance_to, keys_within, square
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
 
+CAST_M: Final = 18.0
+"""How far from the eye people throw shadows."""
 _TILE_REACH_M: Final = 34.0
 """A tile's farthest point from its middle, and what stands over its border."""
 
@@ -73,8 +75,8 @@ class Scene:
         self._tiles: dict[Key, _Tile] = {}
         self._shadows = shadows = light.shadows
         self._surfaces = surfaces(context)
-        self._shaders = TileShaders(context, self._surfaces, shadows)
-        self._wall_shaders = WallShaders(context, self._surfaces, shadows, light.lamps > 0.0)
+        self._shaders = tile_shaders(context, self._surfaces, shadows)
+        self._wall_shaders = wall_shaders(context, self._surfaces, shadows, light.lamps > 0.0)
         self._forms = Forms(context, shadows)
         self._seen = Things(context, self._forms, ("colour",))
         self._standing = Things(context, self._forms, ("still",))
@@ -109,7 +111,7 @@ class Scene:
         xy = street.people.xy
         seen = np.zeros(len(xy), dtype=bool)
         seen[shot.view.rows(xy, PERSON_MARGIN_M)] = True
-        casts = np.abs(xy - middle_of(shot.eye_m)[:2]).max(axis=1, initial=0.0) < REACH_M
+        casts = np.hypot(*(xy - shot.eye_m[:2]).T) < CAST_M
         rows = np.flatnonzero(seen | casts if self._shadows else seen)
         who = street.people.only(rows)
         z = self._ground.heights(who.xy)
@@ -117,7 +119,7 @@ class Scene:
 
     def _cast(self, middle: Floats, street: Street, robot: Placed) -> None:
         """What throws shadows in the square around its middle, seen or not."""
-        cars = np.flatnonzero(np.abs(street.vehicles.xy - middle[:2]).max(axis=1, initial=0.0) < REACH_M)
+        cars = np.flatnonzero(np.hypot(*(street.vehicles.xy - middle[:2]).T) < REACH_M)
         _set(self._movers, [self._vehicles(cars, street.vehicles), robot])
         still = (*middle.tolist(), *self._anchor.tolist())
         if still != self._still_for:

@@ -45,7 +45,6 @@ of a kind returns at once. Back faces are culled in the picture; front faces are
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, Literal, NamedTuple, Protocol
 
 import moderngl
@@ -79,8 +78,10 @@ class Programs(NamedTuple):
     colour: moderngl.Program
     shadow: moderngl.Program
 
-    def of(self, stage: Stage) -> moderngl.Program:
-        return self.colour if stage == "colour" else self.shadow
+    def uniforms(self, name: str) -> list[moderngl.Uniform | None]:
+        """A uniform of both; None where the compiler dropped it."""
+        found = [program.get(name, None) for program in self]
+        return [uniform if isinstance(uniform, moderngl.Uniform) else None for uniform in found]
 
 
 _BLOCK = """#version 430
@@ -173,14 +174,6 @@ def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: boo
         ),
         context.program(vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=_NOTHING),
     )
-
-
-def put(program: moderngl.Program, name: str, value: float | Sequence[float]) -> None:
-    """Set a uniform; one that the compiler dropped is passed over."""
-    if name in program:
-        uniform = program[name]
-        assert isinstance(uniform, moderngl.Uniform)
-        uniform.value = value
 
 
 def anchor_of(eye_m: Floats) -> Floats:

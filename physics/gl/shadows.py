@@ -57,6 +57,8 @@ class ShadowMaps:
             "moving": context.framebuffer(depth_attachment=self._moving),
         }
         self._drawn_for: tuple[float, ...] | None = None
+        self._matrix_for: tuple[float, ...] | None = None
+        self._matrix: Floats = np.eye(4)
 
     def _texture(self, pixels: int) -> moderngl.Texture:
         texture = self._context.depth_texture((pixels, pixels))
@@ -65,8 +67,15 @@ class ShadowMaps:
         texture.repeat_x = texture.repeat_y = False
         return texture
 
+    def matrix(self, middle: Floats, anchor: Floats, light: Lighting) -> Floats:
+        """`shadow_matrix`; the last one is kept."""
+        key = (*middle.tolist(), *anchor.tolist())
+        if key != self._matrix_for:
+            self._matrix_for, self._matrix = key, shadow_matrix(middle, anchor, light.to_sun)
+        return self._matrix
+
     def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Stage], None]) -> None:
-        """Bring the maps up to date; the scene block must hold `shadow_matrix` as its camera."""
+        """Bring the maps up to date; the scene block must hold their matrix as its camera."""
         self._context.enable_only(moderngl.DEPTH_TEST)
         self._context.depth_func = "<"
         self._context.polygon_offset = 1.5, 4.0

@@ -10,7 +10,8 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT
+from cosim.geometry import Floats
+from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Stage, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined
@@ -43,6 +44,32 @@ class Surfaces:
     def bind(self) -> None:
         for array, unit in zip(self._arrays, (SURFACES_UNIT, FACADES_UNIT, FINISH_UNIT), strict=True):
             array.use(unit)
+
+
+class SurfaceShaders:
+    """Programs that look surfaces up, for buffers whose positions are relative to the middle of their tile.
+
+    vertex: declares the uniforms `middle` (from the anchor), and `middle_in_world` where it needs that.
+    """
+
+    def __init__(
+        self, context: moderngl.Context, surfaces: Surfaces, vertex: str, fragment: str, shadows: bool
+    ) -> None:
+        self.surfaces = surfaces
+        self.programs = programs(context, KNOWN + vertex, LOOKED_UP + fragment, shadows)
+        self._middles, self._in_world, known = (
+            self.programs.uniforms(name) for name in ("middle", "middle_in_world", "layers")
+        )
+        for uniform in known:
+            if uniform is not None:
+                uniform.write(surfaces.known)
+
+    def place(self, stage: Stage, middle: Floats, anchor: Floats) -> None:
+        """Draw at (2,) `middle` in world metres from now on."""
+        which = stage != "colour"
+        for uniform, value in ((self._middles[which], middle - anchor), (self._in_world[which], middle)):
+            if uniform is not None:
+                uniform.value = tuple(value.tolist())
 
 
 @lru_cache(maxsize=1)

@@ -5,6 +5,7 @@ Colour and label share one texture (the label is its fourth channel), so that a 
 
 from __future__ import annotations
 
+import cv2
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +31,8 @@ class Target:
         """Colours (H, W, 3) and labels (H, W), the top row first."""
         width, height = self.size
         whole = np.frombuffer(self.frame.read(components=4, dtype="f1"), dtype=np.uint8).reshape(height, width, 4)
-        return np.ascontiguousarray(whole[..., :3]), np.ascontiguousarray(whole[..., 3])
+        colours, labels = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), cv2.extractChannel(whole, 3)
+        return np.asarray(colours, dtype=np.uint8), np.asarray(labels, dtype=np.uint8)
 
     def read_depth(self) -> NDArray[np.float32]:
         """Depth along the view, (H, W) metres."""

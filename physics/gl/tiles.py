@@ -11,8 +11,8 @@ from cosim.geometry import Floats
 from cosim.state import LABELS
 from cosim.streetmap import StreetMap
 from physics.gl.corners import LAYOUT, corners, joined
-from physics.gl.shading import Programs, Stage, programs, put
-from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.gl.shading import Stage
+from physics.gl.surfaces import Surfaces, SurfaceShaders
 from physics.materials import PAVINGS
 from physics.mesh import Mesh
 from physics.paint import paint_in
@@ -22,9 +22,7 @@ from physics.tiles import Tile, surface
 _TINTED: Final = 128
 """Added to the label of a surface whose colour tints its texture."""
 
-_VERTEX: Final = (
-    KNOWN
-    + """
+_VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 uniform vec2 middle;
 uniform vec2 middle_in_world;
@@ -41,11 +39,8 @@ void main() {
     gl_Position = project(at);
 }
 """
-)
 
-_FRAGMENT: Final = (
-    LOOKED_UP
-    + """
+_FRAGMENT: Final = """
 in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
 void main() {
     vec4 seen = texture(surfaces, vec3(spot, layer_label.x));
@@ -53,18 +48,11 @@ void main() {
     show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
 }
 """
-)
 
 
-class TileShaders:
-    """The program of all tiles."""
-
-    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
-        self.programs: Programs = programs(context, _VERTEX, _FRAGMENT, shadows)
-        self.surfaces = surfaces
-        for program in self.programs:
-            if "layers" in program:
-                program["layers"].write(surfaces.known)  # type: ignore[union-attr]
+def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
+    """The program of the ground of all tiles."""
+    return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
 class GroundPart(NamedTuple):
@@ -94,7 +82,7 @@ class TileBuffers:
     """Parts of the ground of one tile. middle: (2,) world metres of the tile's."""
 
     def __init__(
-        self, context: moderngl.Context, shaders: TileShaders, ground: Sequence[GroundPart], middle: Floats
+        self, context: moderngl.Context, shaders: SurfaceShaders, ground: Sequence[GroundPart], middle: Floats
     ) -> None:
         self._middle = middle
         parts = []
@@ -104,18 +92,16 @@ class TileBuffers:
             rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
             parts.append((here, rows))
         rows, triangles = joined(parts)
-        self._programs = shaders.programs
+        self._shaders = shaders
         self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
         content = [(self._corners, *LAYOUT)]
         self._arrays = [
-            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in self._programs
+            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders.programs
         ]
 
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if stage != "moving":
-            program = self._programs.of(stage)
-            put(program, "middle", tuple(self._middle - anchor))
-            put(program, "middle_in_world", tuple(self._middle))
+            self._shaders.place(stage, self._middle, anchor)
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from cosim.geometry import Floats
 from cosim.state import LABELS
 from physics.buildings import Building, facade_meshes
-from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Programs, Stage, programs, put
-from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
+from physics.gl.surfaces import Surfaces, SurfaceShaders
 from physics.mesh import Mesh
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import VARIANTS, WALL_STYLES
@@ -40,9 +40,7 @@ _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
 _LEAST_M: Final = 2.2
 """A narrower wall has no windows."""
 
-_VERTEX: Final = (
-    KNOWN
-    + """
+_VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
 uniform vec2 middle;
 out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
@@ -59,11 +57,8 @@ void main() {
     gl_Position = project(at);
 }
 """
-)
 
-_FRAGMENT: Final = (
-    LOOKED_UP
-    + f"""
+_FRAGMENT: Final = f"""
 layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
 layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
 in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
@@ -93,28 +88,20 @@ void main() {{
     show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
 }}
 """
-)
 
 
-class WallShaders:
+def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool) -> SurfaceShaders:
     """The program of all buildings. night: whether some of their windows are lit."""
-
-    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool) -> None:
-        fragment = ("#define NIGHT\n" if night else "") + _FRAGMENT
-        self.programs: Programs = programs(context, _VERTEX, fragment, shadows)
-        self.surfaces = surfaces
-        for program in self.programs:
-            if "layers" in program:
-                program["layers"].write(surfaces.known)  # type: ignore[union-attr]
+    return SurfaceShaders(context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows)
 
 
 class WallBuffers:
     """The buildings of one tile. middle: (2,) world metres of the tile's."""
 
     def __init__(
-        self, context: moderngl.Context, shaders: WallShaders, buildings: Sequence[Building], middle: Floats
+        self, context: moderngl.Context, shaders: SurfaceShaders, buildings: Sequence[Building], middle: Floats
     ) -> None:
-        self._programs, self._middle = shaders.programs, middle
+        self._shaders, self._middle = shaders, middle
         parts = [rows for building in buildings for rows in _rows(building, shaders.surfaces, middle)]
         self._arrays: list[moderngl.VertexArray] = []
         self._buffers: list[moderngl.Buffer] = []
@@ -126,12 +113,12 @@ class WallBuffers:
         self._buffers = [context.buffer(array.tobytes()) for array in held]
         content = [(self._buffers[0], *_LAYOUT)]
         self._arrays = [
-            context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in self._programs
+            context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in shaders.programs
         ]
 
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if self._arrays and stage != "moving":
-            put(self._programs.of(stage), "middle", tuple(self._middle - anchor))
+            self._shaders.place(stage, self._middle, anchor)
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
