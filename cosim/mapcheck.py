@@ -185,7 +185,12 @@ def check_map(
         unit_possible=not unit,
         long_horizon_possible=not long_horizon,
         reasons=tuple(reasons),
-        notes=(*(() if reasons else (*unit, *long_horizon)), *_land_notes(street_map), *_notes(facts)),
+        notes=(
+            *(() if reasons else (*unit, *long_horizon)),
+            *_land_notes(street_map),
+            *_stairs(sidewalks),
+            *_notes(facts),
+        ),
         problems=tuple(marked),
         features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
     )
@@ -281,6 +286,11 @@ def _unusable(street_map: StreetMap, unit: list[str], long_horizon: list[str]) -
     return [*unit, *long_horizon] if unit and long_horizon else []
 
 
+def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
+    steps = [s.id for s in sidewalks if s.going == "steps"]
+    return [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"] if steps else []
+
+
 def _notes(facts: NetFacts | None) -> list[str]:
     if facts is None:
         return []
@@ -290,7 +300,7 @@ def _notes(facts: NetFacts | None) -> list[str]:
     if facts.levels:
         notes.append(
             f"{len(facts.levels)} walkable edges ({facts.levels_km:.2f} km) are on bridges or in tunnels: they lie "
-            "level with the streets they pass over or under"
+            "level with the streets they pass over or under; routes keep off them"
         )
     if facts.widths_missing:
         notes.append(f"{facts.widths_missing} walkable lanes name no width: SUMO's default of 3.2 m holds")

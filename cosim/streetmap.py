@@ -43,7 +43,8 @@ class Strip:
     id: SUMO edge id. corners: ids of the corners at either end, None at a dead end. signalised and crosses
     (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and gutter), verge_m and
     street_class for sidewalks. road_side: +1 when the road lies left of `line`, -1 right, 0 when there is none.
-    driveways: arc lengths of `line`, in metres, where a driveway's middle crosses the sidewalk.
+    driveways: arc lengths of `line`, in metres, where a driveway's middle crosses the sidewalk. going: plain ground,
+    steps, or a bridge or tunnel, which share their place on the map with what lies below or above.
     """
 
     id: str
@@ -60,6 +61,7 @@ class Strip:
     verge_m: float = 0.0
     road_side: int = 1
     driveways: tuple[float, ...] = ()
+    going: Literal["plain", "steps", "bridge"] = "plain"
 
     @property
     def length_m(self) -> float:

@@ -115,6 +115,8 @@ def draw_way(
     way = reach.path(goal)
     if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
         raise SpecError("the way passes its goal")
+    if any(street_map.strips[port.strip].going != "plain" for port in way):
+        raise SpecError("the way leads over stairs, a bridge or a tunnel")
     crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
     if crossed < max(1, round(target_m / CROSSING_EVERY_M)):
         raise SpecError("the way crosses too few streets")

@@ -16,10 +16,9 @@ import shapely
 from cosim.errors import MapError
 from cosim.mapcheck import STEEP, NetFacts
 from cosim.terrain import FALSE_GRADE
+from sumo_nets.netfile import going_on
 
 GO = frozenset("Gg")
-GROUND = ("no", "", "building_passage")
-"""What the params `bridge` and `tunnel` say of ways on the ground."""
 
 
 def read_facts(path: Path) -> NetFacts:
@@ -186,6 +185,5 @@ def _steepest(shape: str) -> float:
 
 def _off_ground(edge: ET.Element) -> bool:
     """Whether an edge is on a bridge or in a tunnel, as far as the net says so."""
-    said = {param.get("key"): param.get("value", "") for param in edge.findall("param")}
-    raised = any(said.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
-    return raised or said.get("layer", "0") not in ("0", "") or edge.get("type", "").endswith(("_bridge", "_tunnel"))
+    said = {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}
+    return going_on(said, edge.get("type", "")) == "bridge"

@@ -11,7 +11,7 @@ import re
 import subprocess
 import zlib
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -31,6 +31,10 @@ from sumo_nets.seams import close_seams
 LANE_M = 3.2
 """SUMO's width of a lane, sidewalks included, that names none."""
 SPECK_M2 = 0.5
+GROUND = ("no", "", "building_passage")
+"""What the params `bridge` and `tunnel` say of ways on the ground."""
+HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
+TRAMS = frozenset(("tram", "rail_urban"))
 SCHEMA = b"xsi:noNamespaceSchemaLocation"
 
 Attributes = dict[str, str]
@@ -178,7 +182,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         for i, lane in enumerate(edge.lanes):
             if i == footway:
                 walk[edge.attributes["id"]] = (edge, lane, i)
-            elif function != "internal" or not _only_walked(lane):
+            elif (function != "internal" or not _only_walked(lane)) and not _is_track(lane):
                 driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
     left_hand = raw.net.get("lefthand") in ("true", "1")
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
@@ -252,6 +256,12 @@ def _footway(edge: _Edge) -> int:
 
 def _is_verge(lane: Attributes) -> bool:
     return lane.get("type", "") == "green_verge" or lane.get("disallow") == "all" or lane.get("allow") == ""
+
+
+def _is_track(lane: Attributes) -> bool:
+    """Whether only trains or ships go there: no road. Trams run in the street."""
+    allowed = set(lane.get("allow", "").split())
+    return bool(allowed & HEAVY) and allowed <= HEAVY | TRAMS
 
 
 def _corners(areas: dict[str, Attributes], links: Sequence[Attributes]) -> dict[str, Polygon | MultiPolygon]:
@@ -346,7 +356,16 @@ def _strip(
         verge_m=number("verge_m", sum(verges)),
         road_side=side,
         driveways=_driveways(edge.params.get("driveways", ""), line),
+        going=going_on(edge.params, edge.attributes.get("type", "")),
     )
+
+
+def going_on(said: Mapping[str, str], kind: str) -> Literal["plain", "steps", "bridge"]:
+    """What an edge leads over, as far as its params and its type say so; tunnels count as bridges."""
+    raised = any(said.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
+    if raised or said.get("layer", "0") not in ("0", "") or kind.endswith(("_bridge", "_tunnel")):
+        return "bridge"
+    return "steps" if "highway.steps" in kind.split("|") else "plain"
 
 
 def _driveways(points: str, line: Floats) -> tuple[float, ...]:

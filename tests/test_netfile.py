@@ -51,6 +51,41 @@ def written(folder: Path, text: str, name: str = "small.net.xml") -> Path:
     return path
 
 
+def test_trains_and_ships_have_no_road_but_trams_do(tmp_path: Path) -> None:
+    """A railway, a ferry and what OpenStreetMap calls any rail are not read as lanes; a tram's and a bus's are."""
+    row = (
+        '<edge id="{0}" from="L" to="M"><lane id="{0}_0" index="0" allow="{1}" length="9" shape="900,0 909,0"/></edge>'
+    )
+    allowed = {
+        "railway": "rail rail_electric rail_fast",
+        "any": "rail_urban rail tram ship",
+        "ferry": "ship",
+        "light": "rail_urban",
+        "tram": "tram",
+        "shared": "tram bus rail",
+    }
+    rows = "".join(row.format(*pair) for pair in allowed.items())
+    place = read_net(written(tmp_path, NET.replace("<junction", rows + "<junction", 1)))
+    assert {lane.edge for lane in place.lanes.values()} & allowed.keys() == {"light", "tram", "shared"}
+
+
+def test_stairs_bridges_and_tunnels_are_told_from_plain_ground(tmp_path: Path) -> None:
+    """By the type of the edge or by what it says of bridge, tunnel and layer; a passage through a house is plain."""
+    said = {
+        "stairs": ("highway.footway|highway.steps", "", ""),
+        "deck": ("highway.footway", "bridge", "viaduct"),
+        "subway": ("highway.footway", "tunnel", "yes"),
+        "above": ("highway.footway", "layer", "1"),
+        "passage": ("highway.footway", "tunnel", "building_passage"),
+    }
+    lane = '<lane id="{0}_0" index="0" allow="pedestrian" length="9" shape="90,20 99,20"/>'
+    row = '<edge id="{0}" from="L" to="M" type="{1}">' + lane + '<param key="{2}" value="{3}"/></edge>'
+    rows = "".join(row.format(name, *words) for name, words in said.items())
+    strips = read_net(written(tmp_path, NET.replace("<junction", rows + "<junction", 1))).strips
+    going = {"stairs": "steps", "deck": "bridge", "subway": "bridge", "above": "bridge", "passage": "plain"}
+    assert {name: strips[name].going for name in said} == going and strips["path"].going == "plain"
+
+
 def test_strips_lanes_and_corners_are_told_apart(tmp_path: Path) -> None:
     """Sidewalks, shared paths and crossings are strips; verges and carriageways lanes; walking areas corners."""
     place = read_net(written(tmp_path, NET))

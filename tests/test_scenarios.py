@@ -26,6 +26,8 @@ from scenarios.barriers import barrier_at, branches, fenced, prove_single_path
 from scenarios.behaviors import BEHAVIORS
 from scenarios.build import Proof
 from scenarios.catalog import SUITES, suite
+from scenarios.long_horizon import build
+from sumo_nets.mapstore import read_map
 
 SCENARIOS = [scenario for name in SUITES for scenario in suite(name).scenarios]
 
@@ -189,6 +191,18 @@ def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() 
 
     assert reached(barrier_at(street_map, Port("north", 0)))
     assert not reached(barrier_at(street_map, Port("north", 0), slanting=True))
+
+
+@pytest.mark.engine
+def test_routes_keep_off_stairs_and_bridges() -> None:
+    """A map with routes has none left when every way is one of stairs."""
+    where = CityMap(map="sumo-fkk-in")
+    street_map = read_map(where)
+    assert build(where, street_map, WalkGraph(street_map), 0, "plain").crossings
+    steps = {name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()}
+    street_map = dataclasses.replace(street_map, strips=steps)
+    with pytest.raises(SpecError, match="stairs, a bridge or a tunnel"):
+        build(where, street_map, WalkGraph(street_map), 0, "stairs")
 
 
 @pytest.mark.parametrize("name", POLICIES)
