@@ -144,9 +144,10 @@ class Frontage:
         return None
 
     def _clear(self, building: Building) -> bool:
-        if self._mapped is not None and self._mapped.shows("building", building.polygon):
+        outline = building.polygon
+        if self._mapped is not None and self._mapped.shows("building", outline):
             return False
-        area = shapely.buffer(building.polygon, MARGIN_M, join_style="mitre")
+        area = shapely.buffer(outline, MARGIN_M, join_style="mitre")
         kinds: tuple[PieceKind, ...] = ("strip", "corner", "junction", "lane")
         return not any(p for kind in kinds for p in self._map.near(kind, area) if not _is_verge(p))
 

@@ -28,7 +28,7 @@ _SPLINTER_M2: Final = 0.05
 
 
 class MappedThings:
-    """The features of a street map for the engines; a pure function of the map."""
+    """The features of a street map for the engines; a pure function of the map. kinds: of the things it shows."""
 
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
@@ -41,6 +41,7 @@ class MappedThings:
             kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features]) for kind, features in by_kind.items()
         }
         self._trees["building"] = self._house_tree
+        self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
         for i, feature in enumerate(f for f in street_map.features if f.kind != "building"):
             self._props[key_at(feature.x_m, feature.y_m)].append(_prop(i, feature))

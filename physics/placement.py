@@ -107,7 +107,10 @@ class Placement:
         """Props of a sidewalk that fit its zones, the street and each other, and their footprints."""
         if strip.id not in self._drawn:
             props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
-            props = [p for p in props if not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))]
+            shown = self._mapped.kinds
+            props = [
+                p for p in props if p.kind not in shown or not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))
+            ]
             ground = footprints(props)
             if props:
                 free = _fits(self._map, strip, props, ground)
