@@ -163,7 +163,10 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
             f"{check.narrow} sidewalks, {check.narrow_km:.2f} km; narrowest {check.narrowest_m:.2f} m",
         ),
         ("shorter than 1 m", f"{check.stubs} pieces; {check.dead_ends} dead ends"),
-        ("on the road", f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it"),
+        (
+            "on the road",
+            f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it; routes avoid them",
+        ),
         ("over or under a road", f"{check.stacked} sidewalks, with no crossing there"),
         ("guessed sidewalks", guessed),
         ("shown by the map", shown or "no buildings, no things: all are made up"),

@@ -6,12 +6,14 @@ from collections.abc import Sequence
 
 import msgspec
 import numpy as np
+import shapely
+from shapely.geometry import LineString
 
 from cosim.errors import CosimError, MapError, SpecError
 from cosim.events import Event, Kind
 from cosim.geometry import Polyline
 from cosim.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
-from cosim.streetmap import Port, StreetMap, Strip
+from cosim.streetmap import Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
 from scenarios.barriers import barrier_at, branches, prove_single_path
@@ -22,6 +24,9 @@ STRIP_MIN_M = 30.0
 """Start and goal lie on sidewalks at least this long."""
 
 HALF_WIDTH_M = 0.32
+ON_ROAD_M = 2.0
+"""So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the carriageway."""
+
 CROSSING_EVERY_M = 160.0
 EVENT_EVERY_M = 90.0
 EVENT_KINDS: tuple[Kind, ...] = ("obstructing", "frontal")
@@ -68,6 +73,9 @@ def _draw(
     route = Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 3))
     if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
         raise SpecError("length of the line does not fit")
+    crossings = route_crossings(street_map, route, way)
+    if on_road_m(street_map, route, crossings) > ON_ROAD_M:
+        raise SpecError("the way lies on a road: cars drive through who walks there")
     barriers = _barriers(street_map, route, way)
     start, goal = route.at(0.0), route.at(route.length_m)
     return Scenario(
@@ -78,7 +86,7 @@ def _draw(
         start=(start.x_m, start.y_m, start.heading_rad),
         goal=(goal.x_m, goal.y_m),
         route=tuple((float(x), float(y)) for x, y in route.points),
-        crossings=route_crossings(street_map, route, way),
+        crossings=crossings,
         barriers=barriers,
         events=draw_events(street_map, route, way, rng),
         crowd=CrowdSpec(),
@@ -134,6 +142,20 @@ def route_crossings(street_map: StreetMap, route: Polyline, way: Sequence[Port])
         ends = sorted(route.project(*strip.line[i, :2])[0] for i in (0, -1))
         found.append(RouteCrossing(id=strip.id, enter_s_m=ends[0], leave_s_m=ends[1], signalised=strip.signalised))
     return tuple(sorted(found, key=lambda crossing: crossing.enter_s_m))
+
+
+def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> float:
+    """Metres of a route that lie on lanes of roads, crossings and the interior of junctions apart."""
+    s_m = np.arange(0.5, route.length_m, 1.0)
+    for crossing in crossings:
+        s_m = s_m[(s_m < crossing.enter_s_m - 1.0) | (s_m > crossing.leave_s_m + 1.0)]
+    x, y = (np.interp(s_m, route.s_m, route.points[:, k]) for k in (0, 1))
+    lanes = [lane for lane in street_map.near("lane", LineString(route.points)) if isinstance(lane, Lane)]
+    on_road = np.zeros(len(s_m), dtype=bool)
+    for lane in lanes:
+        if lane.kind == "road" and not lane.internal:
+            on_road |= shapely.contains_xy(lane.polygon, x, y)
+    return float(on_road.sum())
 
 
 def draw_events(

@@ -18,15 +18,15 @@ from cosim.errors import SpecError
 from cosim.geometry import Polyline
 from cosim.policies import POLICIES
 from cosim.ports import Privileged
-from cosim.scenario import Barrier, City, CityMap, Scenario, content_hash, read_suite, write_suite
+from cosim.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from cosim.state import NO_VEHICLES, NOBODY, RobotState
-from cosim.streetmap import Corner, Port, StreetMap, Strip, WalkableArea
+from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.walks import WalkGraph
 from scenarios.barriers import barrier_at, branches, fenced, prove_single_path
 from scenarios.behaviors import BEHAVIORS
 from scenarios.build import Proof
 from scenarios.catalog import SUITES, suite
-from scenarios.long_horizon import build
+from scenarios.long_horizon import build, on_road_m
 from sumo_nets.mapstore import read_map
 
 SCENARIOS = [scenario for name in SUITES for scenario in suite(name).scenarios]
@@ -191,6 +191,18 @@ def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() 
 
     assert reached(barrier_at(street_map, Port("north", 0)))
     assert not reached(barrier_at(street_map, Port("north", 0), slanting=True))
+
+
+def test_a_route_on_a_carriageway_is_measured() -> None:
+    """20 m of a route lie on a lane that is drawn over its sidewalk; those of a crossing do not count."""
+    line = np.array([[10.0, 0.0], [30.0, 0.0]])
+    lane = Lane("car_0", "car", "road", line, 3.0, shapely.buffer(LineString(line), 1.5, cap_style="flat"))
+    street_map = dataclasses.replace(cross_map(), lanes={"car_0": lane})
+    route = Polyline([(-30, 0), (38, 0)])
+    assert on_road_m(street_map, route, ()) == pytest.approx(20.0, abs=1.0)
+    crossing = RouteCrossing(id="c", enter_s_m=50.0, leave_s_m=60.0, signalised=False)
+    assert on_road_m(street_map, route, [crossing]) == pytest.approx(9.0, abs=1.0)
+    assert on_road_m(cross_map(), route, ()) == 0.0
 
 
 @pytest.mark.engine
