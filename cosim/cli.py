@@ -7,7 +7,7 @@ import sys
 from contextlib import nullcontext
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import pandas as pd
 import typer
@@ -242,11 +242,17 @@ def doctor() -> None:
         raise typer.Exit(1)
 
 
-@app.command(epilog="Example:  \n`cosim bench --rounds 5`")
+@app.command(epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`")
 def bench(
+    what: Annotated[
+        Literal["environment", "camera"], typer.Argument(help="One environment process, or the cameras side by side.")
+    ] = "environment",
     rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
 ) -> None:
-    """Measure speed and memory of one environment process, part by part."""
+    """Measure speed and memory of one environment process, part by part, or the speed of the cameras."""
+    if what == "camera":
+        bench_cameras(rounds)
+        return
     from scenarios.bench import PARTS, measure, spread
 
     with err.status("measuring ...") as status:
@@ -275,6 +281,31 @@ def bench(
     places.add_row("distance to its edge, us", *spread([p.distance_us for p in report.places]), "<= 20")
     places.add_row("shortest walk, ms", *spread([p.walk_ms for p in report.places]), "<= 2")
     out.print(places)
+
+
+def bench_cameras(rounds: int) -> None:
+    """Measure the cameras in one busy street and print frames a second, targets and ratios."""
+    from physics.cameras import chosen, renderer_of
+    from scenarios.bench import spread
+    from scenarios.bench_cameras import FIGURES, PERSONS, RATIOS, SIZE, measure
+
+    drawn_by = renderer_of(chosen("auto"))
+    on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by
+    with err.status("measuring ...") as status:
+        found = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
+    table = Table(head, "frames/s", "spread", "target")
+    for figure in FIGURES:
+        least = figure.least_fps[on_gpu]
+        cells = spread(found[figure.name]) if found[figure.name] else ("cannot be drawn here", "")
+        table.add_row(figure.name, *cells, "" if least is None else f">= {least:,.4g}")
+    out.print(table)
+    ratios = Table("ratio", "median", "spread", "target")
+    for name, above, below, target in RATIOS:
+        values = [a / b for a, b in zip(found[above], found[below], strict=False)]
+        ratios.add_row(name, *(spread(values) if values else ("cannot be drawn here", "")), target)
+    out.print(ratios)
+    out.print(f"{drawn_by}; {rounds} rounds, medians", highlight=False)
 
 
 class Board:

@@ -15,11 +15,11 @@ from cosim.errors import UsageError, unknown
 out = Console()
 err = Console(stderr=True)
 
-Choice = Literal["auto", "gl", "bullet"]
+Choice = Literal["auto", "gl", "bullet", "bullet-egl"]
 CAMERA_HELP = "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), or auto: gl where it works."
 
 
-def camera_here(choice: Choice) -> Literal["gl", "bullet"]:
+def camera_here(choice: Choice) -> Literal["gl", "bullet", "bullet-egl"]:
     """The camera that a choice comes to on this machine; says so where auto is not gl. Raises EngineError."""
     from physics.cameras import chosen
 

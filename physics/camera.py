@@ -1,4 +1,5 @@
-"""BulletCamera: pictures by PyBullet's software renderer, which needs neither a GPU nor a system library.
+"""BulletCamera: pictures by PyBullet's software renderer, which needs neither a GPU nor a system library, or on
+request by its EGL plugin.
 
 A picture is a function of the robot's state and the street alone: same values, same pixels, whatever was drawn
 before.
@@ -34,17 +35,17 @@ _HAZE_M: Final = 110.0
 class BulletCamera:
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
-    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False) -> None:
+    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
         self.spec, self._pinhole = spec, drawn(spec)
         self._world = world
-        self._depth = depth
+        self._depth, self._egl = depth, egl
         self._canvas: Canvas | None = None
         self._scene: Scene | None = None
 
     def __enter__(self) -> Self:
         if self._canvas is None:
-            self._canvas = Canvas()
+            self._canvas = Canvas(self._egl)
             self._scene = Scene(self._canvas, self._world.ground, self._world.barriers, self._world.model)
         return self
 

@@ -1,4 +1,5 @@
-"""The cameras by name: `gl` where OpenGL can be had, `bullet` anywhere; `auto` takes the first that works.
+"""The cameras by name: `gl` where OpenGL can be had, `bullet` anywhere, `bullet-egl` on request; `auto` takes
+`gl` if it works, else `bullet`.
 
 OpenGL and PyBullet are imported when a camera of theirs is asked for.
 """
@@ -16,8 +17,8 @@ if TYPE_CHECKING:
     from physics.gl.camera import GlCamera
     from physics.world import BulletWorld
 
-CameraName = Literal["gl", "bullet"]
-CameraChoice = Literal["auto", "gl", "bullet"]
+CameraName = Literal["gl", "bullet", "bullet-egl"]
+CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 
 
 def chosen(choice: CameraChoice) -> CameraName:
@@ -31,7 +32,7 @@ def chosen(choice: CameraChoice) -> CameraName:
 
 def renderer_of(name: CameraName) -> str:
     """What draws the pictures, as records name it: pictures are the same bits on the same renderer only."""
-    return context.renderer() if name == "gl" else "bullet-tiny"
+    return context.renderer() if name == "gl" else {"bullet": "bullet-tiny", "bullet-egl": "bullet-egl"}[name]
 
 
 def camera_of(
@@ -44,4 +45,4 @@ def camera_of(
         return GlCamera(world, spec, depth, light or Light())
     from physics.camera import BulletCamera
 
-    return BulletCamera(world, spec, depth)
+    return BulletCamera(world, spec, depth, egl=name == "bullet-egl")

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import tempfile
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -30,19 +32,32 @@ _LIGHT: Final = {
 
 
 class Canvas:
-    """Coloured, labelled bodies and the software renderer. Physics never pays for them: it runs elsewhere."""
+    """Coloured, labelled bodies and a renderer of PyBullet's: TinyRenderer, or its EGL plugin, which needs OpenGL.
 
-    def __init__(self) -> None:
+    Physics never pays for them: it runs elsewhere. Raises EngineError when the plugin does not start.
+    """
+
+    def __init__(self, egl: bool = False) -> None:
         self._client: int = p.connect(p.DIRECT)
         if self._client < 0:
             raise EngineError("PyBullet did not start")
         self._labels = np.zeros(256, dtype=np.uint8)
+        self._renderer: int = p.ER_TINY_RENDERER
+        self._folder: tempfile.TemporaryDirectory[str] | None = None
+        if egl:
+            self._folder = tempfile.TemporaryDirectory(prefix="cosim-shapes-")
+            self._load_egl()
+            self._renderer = p.ER_BULLET_HARDWARE_OPENGL
 
     def close(self) -> None:
         p.disconnect(self._client)
+        if self._folder is not None:
+            self._folder.cleanup()
 
     def shape(self, mesh: Mesh) -> int:
         """A form that bodies can share."""
+        if self._folder is not None:
+            return self._shape_of_file(mesh, Path(self._folder.name))
         with as_lists(mesh.triangles, mesh.vertices, mesh.normals) as (indices, (vertices, normals)):
             shape: int = p.createVisualShape(
                 p.GEOM_MESH, vertices=vertices, indices=indices, normals=normals, physicsClientId=self._client
@@ -99,15 +114,16 @@ class Canvas:
         width, height = size
         view = p.computeViewMatrix(eye_m.tolist(), target_m.tolist(), (0.0, 0.0, 1.0))
         projection = list(p.computeProjectionMatrixFOV(fov_deg, width / height, near_m, far_m))
-        # TinyRenderer looks through a corner of each pixel: half a pixel aside, and it looks through the middle.
-        projection[8] += 1.0 / width
-        projection[9] += 1.0 / height
+        if self._renderer == p.ER_TINY_RENDERER:
+            # It looks through a corner of each pixel: half a pixel aside, and it looks through the middle.
+            projection[8] += 1.0 / width
+            projection[9] += 1.0 / height
         _, _, rgba, depth, mask = p.getCameraImage(
             width,
             height,
             view,
             projection,
-            renderer=p.ER_TINY_RENDERER,
+            renderer=self._renderer,
             physicsClientId=self._client,
             **_LIGHT,
         )
@@ -118,6 +134,26 @@ class Canvas:
         metres = (far_m * near_m / (far_m - (far_m - near_m) * depth)).astype(np.float32)
         rgb = np.ascontiguousarray(np.asarray(rgba, dtype=np.uint8).reshape(height, width, 4)[..., :3])
         return rgb, labels, metres
+
+    def _shape_of_file(self, mesh: Mesh, folder: Path) -> int:
+        """The EGL plugin draws meshes from files alone."""
+        path = folder / f"{len(list(folder.iterdir()))}.obj"
+        corners = mesh.triangles + 1
+        lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in mesh.vertices.tolist()]
+        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.normals.tolist()]
+        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in corners.tolist()]
+        path.write_text("\n".join(lines) + "\n")
+        shape: int = p.createVisualShape(p.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
+        return shape
+
+    def _load_egl(self) -> None:
+        plugin = find_spec("eglRenderer")
+        if plugin is None or plugin.origin is None:
+            raise EngineError("this PyBullet has no EGL plugin: use --camera gl or bullet")
+        if p.loadPlugin(plugin.origin, "_eglRendererPlugin", self._client) < 0:
+            raise EngineError(
+                "PyBullet's EGL plugin did not start: is OpenGL here (cosim doctor)? Or use --camera bullet"
+            )
 
     def _label(self, body: int, label: str) -> None:
         if body >= len(self._labels):

@@ -21,7 +21,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     suite_hash: str
     folder: str
     frames_every_s: float = 0.0
-    camera: Literal["gl", "bullet"] = "bullet"
+    camera: Literal["gl", "bullet", "bullet-egl"] = "bullet"
     live: Live | None = None
 
 

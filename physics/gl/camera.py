@@ -79,8 +79,7 @@ class GlCamera:
         """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
         the picture."""
         taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
-        frame = self._drawn(taken, street, robot, body=False)
-        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
+        return self.through_lens(self._drawn(taken, street, robot, body=False), robot, street)
 
     def picture(
         self,
@@ -97,29 +96,45 @@ class GlCamera:
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
-        with self._context as gl:
+        with self._context:
             target = self._target(taken.size)
-            anchor = anchor_of(taken.eye_m)
-            self._scene.arrange(taken, anchor, street, robot, body)
-            from_sun = np.eye(4)
-            if self._shadows is not None:
-                middle = middle_of(taken.eye_m)
-                from_sun = self._shadows.matrix(middle, anchor, self._light)
-                self._block.write(from_sun, from_sun, taken, anchor, self._light)
-                self._shadows.draw(middle, anchor, self._light, self._scene.draw)
-                self._shadows.bind()
-            self._block.write(camera_matrix(taken, anchor), _TO_TEXTURE @ from_sun, taken, anchor, self._light)
-            target.use()
-            gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
-            gl.front_face = "cw"  # the picture is drawn upside down, to be read top first
-            gl.depth_func = "<"
-            target.frame.clear(depth=1.0)
-            self._scene.draw("colour")
-            self._draw_paint(gl, target)
-            gl.depth_func = "<="
-            self._backdrop.draw()
+            target.clear()
+            self._draw(target, taken, street, robot, body)
             rgb, labels = target.read()
             return Frame(rgb, labels, target.read_depth() if self._depth else None)
+
+    def draw_into(self, target: Target, robot: RobotState, street: Street) -> None:
+        """Draw what `render` shows, but for the lens, into a target that was cleared. The
+        context must be held."""
+        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
+        self._draw(target, taken, street, robot, body=False)
+
+    def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
+        """What the lens makes of a picture that was drawn by `draw_into`."""
+        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
+
+    def _draw(self, target: Target, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> None:
+        gl = self._context
+        if gl is None:
+            raise EngineError("the camera is not running: use GlCamera in a 'with' block")
+        anchor = anchor_of(taken.eye_m)
+        self._scene.arrange(taken, anchor, street, robot, body)
+        from_sun = np.eye(4)
+        if self._shadows is not None:
+            middle = middle_of(taken.eye_m)
+            from_sun = self._shadows.matrix(middle, anchor, self._light)
+            self._block.write(from_sun, from_sun, taken, anchor, self._light)
+            self._shadows.draw(middle, anchor, self._light, self._scene.draw)
+            self._shadows.bind()
+        self._block.write(camera_matrix(taken, anchor), _TO_TEXTURE @ from_sun, taken, anchor, self._light)
+        target.use()
+        gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+        gl.front_face = "cw"  # the picture is drawn upside down, to be read top first
+        gl.depth_func = "<"
+        self._scene.draw("colour")
+        self._draw_paint(gl, target)
+        gl.depth_func = "<="
+        self._backdrop.draw()
 
     def _draw_paint(self, gl: moderngl.Context, target: Target) -> None:
         """Paint changes colours alone: the ground keeps its labels and its depth."""

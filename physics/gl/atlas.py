@@ -1,0 +1,102 @@
+"""Atlas: the robots of many environments in one process, drawn one after the other and read back at once.
+
+The pictures are those of a `GlCamera` each, bit for bit: each is drawn by itself and copied behind the last into one
+buffer on the graphics card. Waiting for that buffer is what costs there; one is waited for while the next is under
+way: `begin` the next pictures before you `end` the last ones.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Final, Self
+
+import moderngl
+
+from cosim.errors import EngineError, UsageError
+from cosim.ports import CameraSpec
+from cosim.scenario import Light
+from cosim.state import Frame, RobotState, Street
+from physics.gl.camera import NOON, GlCamera
+from physics.gl.context import context
+from physics.gl.targets import Target, parted
+from physics.lens import drawn
+from physics.view import SIDE_MAX
+from physics.world import BulletWorld
+
+UNDER_WAY: Final = 2
+"""Pictures that may have begun and not ended."""
+
+Seen = Sequence[tuple[RobotState, Street]]
+"""A robot and its street for each environment."""
+
+
+class Atlas:
+    """One camera for several worlds. Use it in a `with` block. Raises UsageError when the atlas would be too large."""
+
+    def __init__(self, worlds: Sequence[BulletWorld], spec: CameraSpec, light: Light = NOON) -> None:
+        self._size = drawn(spec).width, drawn(spec).height
+        if not worlds or len(worlds) * self._size[1] > 4 * SIDE_MAX:
+            raise UsageError(
+                f"an atlas of {len(worlds)} pictures of {self._size[1]} rows: 1 to {4 * SIDE_MAX // self._size[1]} fit"
+            )
+        self._cameras = [GlCamera(world, spec, light=light) for world in worlds]
+        self._running = ExitStack()
+        self._begun: deque[tuple[moderngl.Buffer, Seen]] = deque()
+        self._context: moderngl.Context | None = None
+
+    def __enter__(self) -> Self:
+        for camera in self._cameras:
+            self._running.enter_context(camera)
+        width, height = self._size
+        with context() as gl:
+            self._target = Target(gl, self._size)
+            room = width * height * 4 * len(self._cameras)
+            self._free = [gl.buffer(reserve=room) for _ in range(UNDER_WAY)]
+        self._context = gl
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._context is not None:
+            with self._context:
+                self._target.release()
+                for buffer in (*self._free, *(buffer for buffer, _ in self._begun)):
+                    buffer.release()
+            self._context = None
+        self._running.close()
+
+    def render(self, seen: Seen) -> list[Frame]:
+        """What every robot sees, in the order of the worlds."""
+        self.begin(seen)
+        return self.end()
+
+    def begin(self, seen: Seen) -> None:
+        """Draw what every robot sees; `end` hands the pictures over."""
+        if self._context is None or not self._free:
+            raise EngineError("the atlas is not running, or has too many pictures under way: `end` some first")
+        with self._context:
+            buffer = self._free.pop()
+            for i, (camera, (robot, street)) in enumerate(zip(self._cameras, seen, strict=True)):
+                self._target.clear()
+                camera.draw_into(self._target, robot, street)
+                self._target.read_into(buffer, i * 4 * self._size[0] * self._size[1])
+        self._begun.append((buffer, seen))
+
+    def end(self) -> list[Frame]:
+        """The pictures that began first and have not ended."""
+        if self._context is None or not self._begun:
+            raise EngineError("no picture of the atlas is under way: `begin` one first")
+        buffer, seen = self._begun.popleft()
+        with self._context:
+            data = memoryview(buffer.read())
+        self._free.append(buffer)
+        each = len(data) // len(self._cameras)
+        frames = [Frame(*parted(data[i * each : (i + 1) * each], self._size)) for i in range(len(self._cameras))]
+        return [
+            camera.through_lens(frame, robot, street)
+            for camera, frame, (robot, street) in zip(self._cameras, frames, seen, strict=True)
+        ]
