@@ -21,7 +21,7 @@ REACH_M: Final = 32.0
 STEP_M: Final = 8.0
 """The lattice of the box's middles."""
 _DEEP_M: Final = 80.0
-_STILL_PX: Final = 1024
+_STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
 
 
