@@ -105,7 +105,11 @@ class Scene:
         for facade, mesh in facade_meshes(self._ground.buildings(key)).items():
             parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
-        bodies = {self._canvas.add(mesh.moved(-middle), colour, label): (at, 0.0) for mesh, colour, label in parts}
+        bodies = {
+            self._canvas.add(mesh.moved(-middle), colour, label): (at, 0.0)
+            for mesh, colour, label in parts
+            if len(mesh)
+        }
         posts = props.posts_in(self._ground.street_map, key)
         for post in posts:
             bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad

@@ -143,7 +143,7 @@ def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[
     street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
     found = []
     for facade, mesh in facade_meshes((building,)).items():
-        if facade < 0:
+        if facade < 0 or not len(mesh):
             continue  # windows of the other camera: here they are painted
         rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
         rows["at"] = mesh.vertices - np.array([*middle, 0.0])
