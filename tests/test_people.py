@@ -14,11 +14,11 @@ from cosim.errors import EngineError
 from cosim.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
 from cosim.geometry import Floats
 from cosim.state import People
-from physics.people.body import COATS, Body, body
+from physics.people.body import COATS, Body, body, far_body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
 from physics.people.families import FAMILIES, skeleton
-from physics.people.figure import LEVELS
+from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.gaits import FRAMES, gait
 from physics.people.looks import ALL, family_of, look
 from physics.people.parts import PARTS, part_colours, part_meshes, placed
@@ -26,7 +26,7 @@ from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, MIRRORED, PARENTS, axis_angle, forward, rodrigues, skinned
 
 ROOT = Path(__file__).parents[1]
-FORMS = [(outfit, level) for outfit in range(len(ALL)) for level in range(LEVELS)]
+FORMS = [(outfit, level) for outfit in range(len(ALL)) for level in range(MESH_LEVELS)]
 
 
 def crowd(n: int, doing: str = "walk", pace: float = 1.4, strides: Floats | None = None) -> People:
@@ -70,10 +70,7 @@ def test_axis_angles_come_back() -> None:
 def test_bodies_are_closed_and_weighted(outfit: int, level: int) -> None:
     """Every edge has two triangles in opposite directions; weights fall and sum to 1; normals are unit vectors."""
     made = body(ALL[outfit], level)
-    edges = np.concatenate([made.triangles[:, [0, 1]], made.triangles[:, [1, 2]], made.triangles[:, [2, 0]]])
-    there = set(map(tuple, edges.tolist()))
-    assert len(there) == len(edges)
-    assert all((b, a) in there for a, b in there)
+    assert closed(made.triangles)
     assert made.weights.sum(axis=1) == pytest.approx(1.0, abs=1e-6)
     assert (np.diff(made.weights, axis=1) <= 1e-7).all() and (made.weights >= 0.0).all()
     assert np.linalg.norm(made.normals, axis=1) == pytest.approx(1.0, abs=1e-4)
@@ -89,19 +86,31 @@ def test_bodies_stand_on_the_ground_at_their_stature() -> None:
         assert float(skin[:, 2].max()) == pytest.approx(skeleton(outfit.family).height_m, abs=0.06)
 
 
-def test_detail_grows_level_by_level() -> None:
-    """Each level has at most half of the triangles of the one before, the last about 900."""
+def closed(triangles: np.ndarray) -> bool:  # type: ignore[type-arg]
+    edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
+    there = set(map(tuple, edges.tolist()))
+    return len(there) == len(edges) and all((b, a) in there for a, b in there)
+
+
+def test_far_bodies_are_closed_and_small() -> None:
+    """Each level has at most 0.7 times the triangles of the one before; the coarsest below 900, in tubes."""
     for outfit in ALL:
-        counts = [len(body(outfit, level).triangles) for level in range(LEVELS)]
-        assert all(b <= 0.62 * a for a, b in pairwise(counts))
-        assert counts[0] < 11000 and counts[-1] < 1100
+        counts = [len(body(outfit, level).triangles) for level in range(MESH_LEVELS)]
+        for level in range(MESH_LEVELS, LEVELS):
+            far = far_body(outfit, level)
+            counts.append(len(far.triangles))
+            assert closed(far.triangles)
+            assert far.weights.sum(axis=1) == pytest.approx(1.0, abs=1e-6)
+            assert (far.weights[~far.still, 2:].sum(axis=1) < 0.5).all()
+        assert all(b <= 0.7 * a for a, b in pairwise(counts))
+        assert counts[0] < 11000 and counts[-1] < 900
 
 
 def test_soles_touch_the_ground_in_stance() -> None:
     """In every frame of every walk, and of every gesture, the lowest point of the body is within 2 cm of the ground."""
     clips = own_clips()
     for k, family in enumerate(FAMILIES):
-        made = body(next(outfit for outfit in ALL if outfit.family == family), 2)
+        made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
         walks = [
             first + np.arange(0, FRAMES, 4) for first, pace in zip(clips.gaits[k], PACES_MPS, strict=True) if pace < 2
         ]

@@ -8,31 +8,26 @@ for those near (four joints per vertex) and one for those far away (two).
 
 from __future__ import annotations
 
-from typing import Final, NamedTuple
+from typing import Final
 
 import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.geometry import Floats
-from cosim.state import LABELS, People
-from physics.gl.shading import Stage, programs
-from physics.people.body import COATS, Body, body
+from cosim.state import People
+from physics.gl.shading import Stage
+from physics.gl.skins import mesh_skins, tube_skins
+from physics.people.body import COATS, Body, body, far_body
 from physics.people.clips import Clips, own_clips
-from physics.people.figure import LEVELS
+from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.looks import ALL, look
 from physics.people.poses import poses
 from physics.view import Shot
 
-LEVEL_PX: Final = (170.0, 60.0, 26.0)
+LEVEL_PX: Final = (170.0, 60.0, 22.0)
 """Drawn height of a body, in pixels, below which the next coarser level is taken."""
 
-CORNER: Final = np.dtype(
-    [("at", "f4", 3), ("normal", "u1", 4), ("joints", "u1", 4), ("weights", "u1", 4), ("coat", "u1", 4)]
-)
-"""normal: as in corners.CORNER, its fourth how far fat stands out; weights: of 255; coat: row of COATS, three spare."""
-
-_NEAR_LEVELS: Final = 2
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
 
@@ -64,93 +59,6 @@ void main() {
 }
 """
 
-_VERTEX: Final = """
-layout(binding = 0) uniform sampler2D posed;
-layout(binding = 1) uniform sampler2D dyed;
-in vec3 in_at; in vec4 in_normal; in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
-in int person; in float girth;
-out vec3 at; out vec3 normal; flat out vec3 albedo;
-void main() {
-    vec3 outward = in_normal.xyz * (255.0 / 127.0) - 1.0;
-    vec4 here = vec4(in_at + outward * (in_normal.w * girth), 1.0);
-    vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
-    for (int k = 0; k < BONES; k++) {
-        int column = 3 * int(in_joints[k]);
-        x += in_weights[k] * texelFetch(posed, ivec2(column, person), 0);
-        y += in_weights[k] * texelFetch(posed, ivec2(column + 1, person), 0);
-        z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
-    }
-#if BONES < 4
-    float share = 1.0 / (in_weights.x + in_weights.y);
-    x *= share; y *= share; z *= share;
-#endif
-    at = vec3(dot(x, here), dot(y, here), dot(z, here));
-    normal = vec3(dot(x.xyz, outward), dot(y.xyz, outward), dot(z.xyz, outward));
-    albedo = texelFetch(dyed, ivec2(int(in_coat.x), person), 0).rgb;
-    gl_Position = project(at);
-}
-"""
-
-_FRAGMENT: Final = f"""
-in vec3 at; in vec3 normal; flat in vec3 albedo;
-void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
-"""
-
-
-class _Bodies:
-    """Bodies of all outfits at all levels in one vertex and one index buffer; they are made when first needed."""
-
-    def __init__(self, context: moderngl.Context, worn: Body | None) -> None:
-        self._context, self._worn = context, worn
-        self._rows: list[NDArray[np.void]] = []
-        self._indices: list[NDArray[np.uint32]] = []
-        self._starts: dict[tuple[int, int], tuple[int, int, int]] = {}
-        self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
-        self.version = 0
-
-    def start(self, outfit: int, level: int) -> tuple[int, int, int]:
-        """Count of indices, first index, first vertex."""
-        key = (outfit, level) if self._worn is None else (0, 0)
-        if key not in self._starts:
-            made = body(ALL[outfit], level) if self._worn is None else self._worn
-            first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
-            self._rows.append(corners(made))
-            self._indices.append(made.triangles.ravel().astype(np.uint32))
-            self._starts[key] = len(self._indices[-1]), first, base
-            self.release()
-            self.version += 1
-        return self._starts[key]
-
-    def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
-        if self._buffers is None:
-            rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
-            self._buffers = self._context.buffer(rows.tobytes()), self._context.buffer(indices.tobytes())
-        return self._buffers
-
-    def release(self) -> None:
-        for buffer in self._buffers or ():
-            buffer.release()
-        self._buffers = None
-
-
-def corners(made: Body) -> NDArray[np.void]:
-    """(V,) rows of CORNER."""
-    rows = np.zeros(len(made.vertices), dtype=CORNER)
-    rows["at"] = made.vertices
-    rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
-    rows["normal"][:, 3] = np.rint(255.0 * made.fat)
-    rows["joints"], rows["coat"][:, 0] = made.joints, made.coat
-    rows["weights"] = np.rint(255.0 * made.weights)
-    rows["weights"][:, 0] += (255 - rows["weights"].sum(axis=1, dtype=np.int64)).astype(np.uint8)
-    return rows
-
-
-class _Arrays(NamedTuple):
-    """The bodies as a pair of programs reads them."""
-
-    colour: moderngl.VertexArray
-    shadow: moderngl.VertexArray
-
 
 class Crowd:
     """The people of a picture. shadows: whether they are shaded by shadow maps.
@@ -167,10 +75,10 @@ class Crowd:
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
-        self._programs = [programs(context, f"#define BONES {k}\n" + _VERTEX, _FRAGMENT, shadows) for k in (4, 2)]
-        self._bodies = _Bodies(context, worn)
-        self._bound = -1
-        self._arrays: list[_Arrays] = []
+        near = (lambda outfit, level: body(ALL[outfit], level)) if worn is None else (lambda outfit, level: worn)
+        self._near = mesh_skins(context, near, shadows)
+        self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level), shadows)
+        self._worn = worn is not None
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
         self._split = (0, 0, 0)
         self._room = 0
@@ -219,22 +127,18 @@ class Crowd:
         near, far, shadow = self._split
         if stage == "still" or near + far + shadow == 0:
             return
-        if self._bound != self._bodies.version:
-            self._bind()
         self._matrices.use(0)
         self._dyed.use(1)
+        held = self._instances, self._commands
         if stage == "moving":
-            if not shadow:
-                return
-            self._arrays[1].shadow.render_indirect(self._commands, moderngl.TRIANGLES, count=shadow, first=near + far)
-            return
-        if near:
-            self._arrays[0].colour.render_indirect(self._commands, moderngl.TRIANGLES, count=near)
-        if far:
-            self._arrays[1].colour.render_indirect(self._commands, moderngl.TRIANGLES, count=far, first=near)
+            (self._near if self._worn else self._far).draw(stage, *held, shadow, near + far)
+        else:
+            self._near.draw(stage, *held, near, 0)
+            self._far.draw(stage, *held, far, near)
 
     def release(self) -> None:
-        self._bodies.release()
+        self._near.release()
+        self._far.release()
         self._release_room()
         for thing in (self._baked, self._everywhere, self._pose):
             thing.release()
@@ -245,10 +149,12 @@ class Crowd:
         """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows. A level of -1 is
         not in the picture."""
         coarsest = np.full(len(outfit), LEVELS - 1)
+        if self._worn:
+            level, coarsest, outfit = np.minimum(level, 0), np.zeros_like(level), np.zeros_like(outfit)
         rows, commands, split = [], [], []
         at = 0
-        near = (level >= 0) & (level < _NEAR_LEVELS)
-        for kind, chosen in ((level, near), (level, level >= _NEAR_LEVELS), (coarsest, casts)):
+        near = (level >= 0) & (level < MESH_LEVELS)
+        for kind, chosen in ((level, near), (level, level >= MESH_LEVELS), (coarsest, casts)):
             who = np.flatnonzero(chosen)
             key = kind[who] * len(ALL) + outfit[who]
             order = np.argsort(key, kind="stable")
@@ -256,7 +162,9 @@ class Crowd:
             first = np.flatnonzero(np.diff(key, prepend=-1))
             lengths = np.diff(first, append=len(who))
             for k, many in zip(first.tolist(), lengths.tolist(), strict=True):
-                indices, index, vertex = self._bodies.start(int(outfit[who[k]]), int(kind[who[k]]))
+                form, detail = int(outfit[who[k]]), int(kind[who[k]])
+                skins = self._near if detail < MESH_LEVELS else self._far
+                indices, index, vertex = skins.start(form, detail)
                 commands.append((indices, many, index, vertex, at + k))
             rows.append(who)
             split.append(len(first))
@@ -273,7 +181,7 @@ class Crowd:
     def _grow(self, room: int) -> None:
         """Make room for more people."""
         self._release_room()
-        self._room, self._bound = room, -1
+        self._room = room
         self._told = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
@@ -283,26 +191,11 @@ class Crowd:
         self._held = [self._posed, self._told, self._dyed, self._matrices, self._instances, self._commands]
 
     def _release_room(self) -> None:
-        for array in self._arrays:
-            array.colour.release()
-            array.shadow.release()
+        self._near.release()
+        self._far.release()
         for thing in self._held:
             thing.release()
-        self._arrays, self._held = [], []
-
-    def _bind(self) -> None:
-        vertices, indices = self._bodies.buffers()
-        layout = ("3f4 4f1 4u1 4f1 4u1", "in_at", "in_normal", "in_joints", "in_weights", "in_coat")
-        content = [(vertices, *layout), (self._instances, "1i4 1f4/i", "person", "girth")]
-
-        def array(program: moderngl.Program) -> moderngl.VertexArray:
-            return self._context.vertex_array(program, content, indices, skip_errors=True)
-
-        for old in self._arrays:
-            old.colour.release()
-            old.shadow.release()
-        self._arrays = [_Arrays(array(both.colour), array(both.shadow)) for both in self._programs]
-        self._bound = self._bodies.version
+        self._held = []
 
 
 def levels(xy: Floats, z_m: Floats, shot: Shot) -> NDArray[np.intp]:

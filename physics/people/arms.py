@@ -36,12 +36,12 @@ def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
         skin = [(t, a * f, s * f, j) for t, a, s, j in keys]
         cloth = [(t, a * f + 0.005 + 0.7 * loose, s * f + 0.005 + 0.7 * loose, j) for t, a, s, j in keys]
         if sleeve == "long":
-            pieces.append(_arm(cloth[:-1], side, left, "top", (22, 11, 7, 5)))
+            pieces.append(_arm(cloth[:-1], side, left, "top", (22, 11, 9, 7)))
             pieces.append(_arm(skin[-3:], side, left, "skin", (3, 2, 0, 0), SMALL))
         else:
             short = [*cloth[:5], (0.165, 0.056 * f + loose, 0.054 * f + loose, {shoulder: 1.0})]
             pieces.append(_arm(short, side, left, "top", (10, 6, 4, 4)))
-            pieces.append(_arm(skin[3:], side, left, "skin", (18, 10, 6, 4)))
+            pieces.append(_arm(skin[3:], side, left, "skin", (18, 10, 8, 6)))
         pieces += _hand(side, left)
     return pieces
 
@@ -73,9 +73,9 @@ def _hand(side: str, left: float) -> list[Piece]:
     )
     whole = (
         *palm[:-1],
-        (0.650, 0.0, 0.041, 0.013, hand),
-        (0.685, -0.002, 0.037, 0.011, hand),
-        (0.704, -0.004, 0.024, 0.008, hand),
+        (0.650, 0.0, 0.037, 0.012, hand),
+        (0.685, -0.002, 0.033, 0.010, hand),
+        (0.704, -0.004, 0.020, 0.007, hand),
     )
     pieces = [
         Piece(
@@ -102,7 +102,7 @@ def _hand(side: str, left: float) -> list[Piece]:
         on_arm(0.560 + 0.078 * share, 0.030 + 0.052 * share, -0.008 * share, thick, thick, wrist, left)
         for share, thick in ((0.0, 0.015), (0.35, 0.0135), (0.75, 0.0105), (1.0, 0.006))
     ]
-    pieces.append(Piece("skin", tuple(thumb), (6, 5, 0, 0), (4, 3, 0, 0)))
+    pieces.append(Piece("skin", tuple(thumb), (6, 5, 4, 0), (4, 3, 3, 0)))
     return pieces
 
 

@@ -13,9 +13,9 @@ from cosim.geometry import Floats
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
-from physics.people.figure import LEVELS, Build, Legs, Sleeve, legs, trunk
+from physics.people.figure import LEVELS, MESH_LEVELS, Build, Legs, Sleeve, legs, trunk
 from physics.people.head import about_head, neck_and_head
-from physics.people.lofts import Piece, lofted
+from physics.people.lofts import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
 from physics.people.wear import Carried, Hair, carried, hair, headgear
 
@@ -53,11 +53,29 @@ class Body:
     fat: NDArray[np.float32]
 
 
+@dataclass(frozen=True, slots=True)
+class FarBody:
+    """A body of tubes, whose rings are turned towards the eye when it is drawn (`lofts.Tube`). middle, ahead, side
+    (V, 3); ring (V, 4); still (V,) whose rings are not turned; the
+    rest as in Body."""
+
+    middle: NDArray[np.float32]
+    ahead: NDArray[np.float32]
+    side: NDArray[np.float32]
+    ring: NDArray[np.float32]
+    triangles: NDArray[np.int32]
+    joints: NDArray[np.uint8]
+    weights: NDArray[np.float32]
+    coat: NDArray[np.uint8]
+    fat: NDArray[np.float32]
+    still: NDArray[np.bool_]
+
+
 @lru_cache(maxsize=128)
 def body(outfit: Outfit, level: int) -> Body:
-    """The body at a level: 0 is full detail, LEVELS - 1 the coarsest."""
-    if not 0 <= level < LEVELS:
-        raise ValueError(f"levels go from 0 to {LEVELS - 1}: {level}")
+    """The body at a level of meshes: 0 is full detail."""
+    if not 0 <= level < MESH_LEVELS:
+        raise ValueError(f"levels of meshes go from 0 to {MESH_LEVELS - 1}: {level}")
     surfaces = [(piece.coat, lofted(piece, level)) for piece in pieces(outfit) if piece.sides[level]]
     starts = np.cumsum([0, *(len(s.vertices) for _, s in surfaces)])
     vertices = np.concatenate([s.vertices for _, s in surfaces])
@@ -75,6 +93,33 @@ def body(outfit: Outfit, level: int) -> Body:
         few,
         coat.astype(np.uint8),
         np.concatenate([s.fat for _, s in surfaces]).astype(np.float32),
+    )
+
+
+@lru_cache(maxsize=128)
+def far_body(outfit: Outfit, level: int) -> FarBody:
+    """The body at a level of tubes, MESH_LEVELS to LEVELS - 1."""
+    if not MESH_LEVELS <= level < LEVELS:
+        raise ValueError(f"levels of tubes go from {MESH_LEVELS} to {LEVELS - 1}: {level}")
+    tubes = [(piece.coat, tube(piece, level)) for piece in pieces(outfit) if piece.sides[level]]
+    starts = np.cumsum([0, *(len(t.middle) for _, t in tubes)])
+    weights = np.concatenate([_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes])
+    even = np.concatenate([t.weights for _, t in tubes])
+    family = skeleton(outfit.family)
+    scale = family.height_m / 1.75
+    joints, few = strongest(weights)
+    coat = np.repeat([COATS.index(coat) for coat, _ in tubes], [len(t.middle) for _, t in tubes])
+    return FarBody(
+        _fitted(np.concatenate([t.middle for _, t in tubes]), even, family).astype(np.float32),
+        (scale * np.concatenate([t.ahead for _, t in tubes])).astype(np.float32),
+        (scale * np.concatenate([t.side for _, t in tubes])).astype(np.float32),
+        np.concatenate([t.ring for _, t in tubes]).astype(np.float32),
+        np.concatenate([t.triangles + k for (_, t), k in zip(tubes, starts.tolist(), strict=False)]).astype(np.int32),
+        joints,
+        few,
+        coat.astype(np.uint8),
+        np.concatenate([t.fat for _, t in tubes]).astype(np.float32),
+        np.repeat([t.still for _, t in tubes], [len(t.middle) for _, t in tubes]),
     )
 
 

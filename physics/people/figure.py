@@ -12,12 +12,14 @@ from typing import Final, Literal
 from physics.people.lofts import Joints, Piece, Ring
 
 LEVELS: Final = 4
+"""Levels of detail: two of meshes, then two of tubes."""
+MESH_LEVELS: Final = 2
 Sleeve = Literal["long", "short"]
 Legs = Literal["trousers", "shorts", "skirt", "coat"]
 
-TORSO: Final = (28, 18, 12, 8)
-LIMB: Final = (14, 10, 8, 6)
-SMALL: Final = (12, 8, 6, 5)
+TORSO: Final = (28, 18, 6, 4)
+LIMB: Final = (14, 10, 6, 4)
+SMALL: Final = (12, 8, 6, 4)
 FINE: Final = (6, 4, 0, 0)
 
 
@@ -62,8 +64,8 @@ def trunk(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Pie
         )
     if kind == "coat":
         rings = [*_tails(build, loose), *rings[1:]]
-        return [Piece("top", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (32, 16, 11, 9)), _seat(build)]
-    return [Piece("top", (_rim(rings[0], -0.004, 0.93), *rings), TORSO, (26, 13, 8, 7)), _seat(build)]
+        return [Piece("top", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (32, 16, 12, 10)), _seat(build)]
+    return [Piece("top", (_rim(rings[0], -0.004, 0.93), *rings), TORSO, (26, 13, 10, 9)), _seat(build)]
 
 
 def _rim(hem: Ring, up_m: float, size: float) -> Ring:
@@ -114,7 +116,7 @@ def _seat(build: Build) -> Piece:
         upright((x, 0.0, z), front, behind / front, wide + 0.5 * b * (z > 0.9), joints, 2.4, 1.0)
         for z, x, front, behind, wide, joints in keys
     ]
-    return Piece("bottom", tuple(rings), TORSO, (11, 6, 5, 4))
+    return Piece("bottom", tuple(rings), (28, 18, 0, 0), (11, 6, 0, 0))
 
 
 def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece]:
@@ -144,9 +146,9 @@ def legs(build: Build, kind: Legs, bare: bool, loose: float = 0.0) -> list[Piece
                 for z, x, y, a, s, j in keys[:-1]
             ]
             cloth[-1] = (0.085, -0.020, 0.092, 0.064, 0.056, {knee: 0.6, ankle: 0.4})
-            pieces.append(_leg(cloth, left, build, "bottom", (22, 12, 8, 6)))
+            pieces.append(_leg(cloth, left, build, "bottom", (22, 12, 8, 7)))
         else:
-            pieces.append(_leg(keys if kind == "skirt" else keys[3:], left, build, "skin", (22, 12, 8, 6)))
+            pieces.append(_leg(keys if kind == "skirt" else keys[3:], left, build, "skin", (22, 12, 8, 7)))
             if kind == "shorts":
                 wide = [(z, x, y, a + 0.012, s + 0.012, j) for z, x, y, a, s, j in keys[:6]]
                 pieces.append(_leg(wide, left, build, "bottom", (10, 6, 4, 3)))
@@ -178,7 +180,7 @@ def _skirt(build: Build, loose: float) -> Piece:
         )
     ]
     rings = [*_tails(build, loose + 0.004), *waist, _rim(waist[-1], 0.003, 0.9)]
-    return Piece("bottom", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (16, 9, 7, 6))
+    return Piece("bottom", (_rim(rings[0], 0.03, 0.85), *rings), TORSO, (16, 9, 7, 7))
 
 
 def _shoe(side: str, left: float) -> list[Piece]:
@@ -202,7 +204,7 @@ def _shoe(side: str, left: float) -> list[Piece]:
         half = 0.5 * (high - low)
         y = left * (0.092 + 0.06 * (x + 0.025))
         rings.append(Ring((x, y, low + half), (0.0, 0.0, half), (0.0, wide, 0.0), joints, 1.0, 2.6))
-    return [Piece("shoes", tuple(rings), (12, 8, 6, 4), (14, 9, 6, 5))]
+    return [Piece("shoes", tuple(rings), (12, 8, 6, 4), (14, 9, 6, 6))]
 
 
 def upright(

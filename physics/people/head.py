@@ -37,8 +37,8 @@ def neck_and_head(build: Build) -> list[Piece]:
     ]
     pieces = [
         Piece("skin", tuple(neck), SMALL, (6, 4, 3, 2)),
-        Piece("skin", tuple(head), (24, 14, 9, 7), (20, 11, 7, 6)),
-        Piece("skin", tuple(_nose()), (8, 5, 0, 0), (6, 4, 0, 0)),
+        Piece("skin", tuple(head), (24, 14, 6, 4), (20, 11, 8, 7)),
+        Piece("skin", tuple(_nose()), (8, 5, 4, 0), (6, 4, 3, 0)),
         ball("lips", (0.084, 0.0, 1.577), (0.010, 0.023, 0.0065), {"head": 1.0}, (8, 5, 0, 0)),
     ]
     for left in (1.0, -1.0):

@@ -67,24 +67,75 @@ def lofted(piece: Piece, level: int) -> Surface:
     rings = _points(table, angle)
     grow = _perimeters(_points(table, _ROUND)) / np.maximum(_perimeters(rings), 1e-9)
     rings = table[:, None, :3] + grow[:, None, None] * (rings - table[:, None, :3])
-    n, k = len(table), sides
-    ends = table[[0, -1], :3]
-    vertices = np.concatenate([rings.reshape(-1, 3), ends])
-    around, after = np.arange(k), (np.arange(k) + 1) % k
-    base = k * np.arange(n - 1)[:, None]
-    quads = np.stack(
-        [base + around, base + after, base + k + after, base + around, base + k + after, base + k + around]
-    )
-    sheet = np.moveaxis(quads, 0, -1).reshape(-1, 3)
-    low = np.stack([np.full(k, n * k), after, around], 1)
-    high = np.stack([np.full(k, n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
-    triangles = np.concatenate([sheet, low, high]).astype(np.int32)
+    vertices = np.concatenate([rings.reshape(-1, 3), table[[0, -1], :3]])
+    triangles = _sheet(len(table), sides)
     if _volume(vertices, triangles) < 0.0:
         triangles = triangles[:, ::-1].copy()
-    own = np.concatenate([np.repeat(table[:, 12:], k, axis=0), table[[0, -1], 12:]])
-    weights = np.maximum(own[:, :24], 0.0)
-    weights /= weights.sum(axis=1, keepdims=True)
-    return Surface(vertices, triangles, weights, own[:, 24])
+    own = np.concatenate([np.repeat(table[:, 12:], sides, axis=0), table[[0, -1], 12:]])
+    return Surface(vertices, triangles, _shares(own), own[:, 24])
+
+
+@dataclass(frozen=True, slots=True)
+class Tube:
+    """A piece whose rings a renderer turns towards the eye: two corners of each lie on its outline from there, so that
+    few corners draw the outline of the round ring.
+
+    middle, ahead, side: (V, 3) of the corner's ring; ring: (V, 4) back, square, cosine and sine of the angle from the
+    outline to the corner; triangles (T, 3); weights (V, 24); fat (V,). still: its corners are not turned, their
+    angles begin at `ahead`.
+    """
+
+    middle: Floats
+    ahead: Floats
+    side: Floats
+    ring: Floats
+    triangles: NDArray[np.int32]
+    weights: Floats
+    fat: Floats
+    still: bool
+
+    @property
+    def corners(self) -> Floats:
+        """(V, 3) about where the corners are when they are not turned."""
+        return np.asarray(self.middle + self.ring[:, 2:3] * self.ahead + self.ring[:, 3:4] * self.side)
+
+
+def tube(piece: Piece, level: int) -> Tube:
+    """A piece at a coarse level, with an even number of sides. One that follows both legs spreads to its sides, which
+    rings turned towards the eye cannot show: its corners stay where they are, and there are more."""
+    table, sides = _chosen(_table(piece.rings), piece.rings_kept[level]), piece.sides[level]
+    spreads = bool((np.minimum(table[:, 12 + INDEX["left_hip"]], table[:, 12 + INDEX["right_hip"]]) > 0.15).any())
+    if spreads:
+        sides = max(2 * sides, 10)
+        table[:, 3:9] *= np.pi / (sides * np.sin(np.pi / sides))
+    angle = 2.0 * np.pi * (np.arange(sides) + 0.5 * spreads) / sides
+    solid = np.concatenate([_points(table, angle).reshape(-1, 3), table[[0, -1], :3]])
+    triangles = _sheet(len(table), sides)
+    if _volume(solid, triangles) < 0.0:
+        triangles = triangles[:, ::-1].copy()
+    poles = table[[0, -1]]
+    poles[:, 3:9] *= 1e-3
+    rows = np.concatenate([np.repeat(table, sides, axis=0), poles])
+    corner = np.concatenate([np.tile(angle, len(table)), [0.0, 0.0]])
+    ring = np.column_stack([rows[:, 9:11], np.cos(corner), np.sin(corner)])
+    return Tube(rows[:, :3], rows[:, 3:6], rows[:, 6:9], ring, triangles, _shares(rows[:, 12:]), rows[:, 36], spreads)
+
+
+def _sheet(rings: int, sides: int) -> NDArray[np.int32]:
+    """(T, 3) triangles between rings of vertices one after another, and to the two poles behind them."""
+    n, k = rings, sides
+    around, after = np.arange(k), (np.arange(k) + 1) % k
+    base = k * np.arange(n - 1)[:, None]
+    quads = [base + around, base + after, base + k + after, base + around, base + k + after, base + k + around]
+    sheet = np.moveaxis(np.stack(quads), 0, -1).reshape(-1, 3)
+    low = np.stack([np.full(k, n * k), after, around], 1)
+    high = np.stack([np.full(k, n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
+    return np.concatenate([sheet, low, high]).astype(np.int32)
+
+
+def _shares(rows: Floats) -> Floats:
+    weights = np.maximum(rows[:, :24], 0.0)
+    return np.asarray(weights / weights.sum(axis=1, keepdims=True))
 
 
 def ball(

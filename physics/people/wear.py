@@ -12,7 +12,7 @@ Hair = Literal["short", "crop", "bob", "long", "bun", "tail"]
 Carried = Literal["", "bag", "backpack", "phone"]
 
 _HEAD: Final[Joints] = {"head": 1.0}
-_HAIR: Final = (18, 11, 8, 6)
+_HAIR: Final = (18, 11, 6, 4)
 
 
 def hair(style: Hair) -> list[Piece]:
@@ -46,9 +46,9 @@ def hair(style: Hair) -> list[Piece]:
         if style == "long" and z < 1.5:
             x, wide = x - 0.022, wide + 0.022
         rings.append(upright((x, 0.0, top), front, behind / front, wide, joints, 2.1))
-    pieces = [Piece("hair", tuple(rings), _HAIR, (15, 9, 7, 6))]
+    pieces = [Piece("hair", tuple(rings), _HAIR, (15, 9, 7, 5))]
     if style == "bun":
-        pieces.append(ball("hair", (-0.125, 0.0, 1.700), (0.034, 0.038, 0.036), _HEAD, (10, 7, 6, 5)))
+        pieces.append(ball("hair", (-0.125, 0.0, 1.700), (0.034, 0.038, 0.036), _HEAD, (10, 7, 6, 4)))
     if style == "tail":
         keys = (
             (1.690, -0.105, 0.018),
@@ -77,7 +77,7 @@ def headgear() -> list[Piece]:
         Ring((x, 0.0, z), (0.0, 0.0, 0.005), (0.0, wide, 0.0), _HEAD, 1.0, 2.4)
         for x, z, wide in ((0.060, 1.690, 0.066), (0.100, 1.688, 0.068), (0.140, 1.681, 0.056), (0.165, 1.673, 0.026))
     ]
-    return [Piece("cap", tuple(rings), _HAIR, (9, 6, 5, 4)), Piece("cap", tuple(visor), (10, 8, 6, 4), (5, 4, 4, 3))]
+    return [Piece("cap", tuple(rings), _HAIR, (9, 6, 5, 4)), Piece("cap", tuple(visor), (10, 8, 6, 4), (5, 4, 3, 3))]
 
 
 def carried(what: Carried, loose: float = 0.0) -> list[Piece]:
@@ -102,7 +102,7 @@ def _bag() -> Piece:
         (0.962, 0.10, 0.018),
     )
     rings = [upright((-0.01, 0.225, z), deep, 1.0, wide, joints, 3.2) for z, deep, wide in keys]
-    return Piece("bag", tuple(rings), (14, 10, 8, 6), (6, 6, 4, 4))
+    return Piece("bag", tuple(rings), (14, 12, 6, 4), (6, 6, 5, 4))
 
 
 def _strap(loose: float) -> Piece:
@@ -117,7 +117,7 @@ def _strap(loose: float) -> Piece:
             if 0.0 < share < 1.0
             else ({"pelvis": 1.0} if share == 0.0 else {"spine3": 1.0})
         )
-        rings.append(Ring((-0.012, y, z), (front + loose + 0.006, 0.0, 0.0), (0.0, 0.016, 0.016), joints, 1.0, 3.5))
+        rings.append(Ring((-0.012, y, z), (front + loose + 0.006, 0.0, 0.0), (0.0, 0.016, 0.016), joints, 0.78, 3.5))
     return Piece("bag", tuple(rings), (16, 10, 0, 0), (10, 6, 0, 0))
 
 
@@ -133,7 +133,7 @@ def _backpack() -> Piece:
         (1.44, 0.02, 0.06),
     )
     rings = [upright((-0.175 + 0.012 * (z > 1.3), 0.0, z), deep, 1.0, wide, joints, 2.8) for z, deep, wide in keys]
-    return Piece("bag", tuple(rings), (16, 12, 8, 6), (9, 7, 5, 4))
+    return Piece("bag", tuple(rings), (16, 12, 6, 4), (9, 7, 6, 5))
 
 
 def _shoulder_strap(left: float, loose: float) -> Piece:
@@ -165,4 +165,4 @@ def _phone() -> Piece:
         on_arm(0.585 + 0.145 * share, 0.0, -0.020, 0.036 * size, 0.006 * size, {"left_hand": 1.0}, 1.0, 3.5)
         for share, size in ((0.0, 0.9), (0.03, 1.0), (0.97, 1.0), (1.0, 0.9))
     ]
-    return Piece("dark", tuple(rings), (10, 8, 0, 0), (4, 4, 0, 0))
+    return Piece("dark", tuple(rings), (10, 8, 6, 0), (4, 4, 3, 0))
