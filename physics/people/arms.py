@@ -18,10 +18,10 @@ def arms(build: Build, sleeve: Sleeve, loose: float = 0.0) -> list[Piece]:
         collar, shoulder, elbow, wrist = (f"{side}_{part}" for part in ("collar", "shoulder", "elbow", "wrist"))
         keys = (
             # way along the arm from the shoulder, half depth, half width across, weights
-            (-0.050, 0.026, 0.018, {"spine3": 0.5, collar: 0.5}),
-            (-0.028, 0.042, 0.028, {"spine3": 0.2, collar: 0.55, shoulder: 0.25}),
-            (0.000, 0.052, 0.037, {collar: 0.5, shoulder: 0.5}),
-            (0.040, 0.056, 0.047, {collar: 0.15, shoulder: 0.85}),
+            (-0.020, 0.020, 0.014, {"spine3": 0.1, collar: 0.5, shoulder: 0.4}),
+            (-0.008, 0.040, 0.030, {collar: 0.5, shoulder: 0.5}),
+            (0.014, 0.053, 0.043, {collar: 0.35, shoulder: 0.65}),
+            (0.050, 0.057, 0.051, {collar: 0.1, shoulder: 0.9}),
             (0.110, 0.052, 0.050, {shoulder: 1.0}),
             (0.190, 0.045, 0.045, {shoulder: 1.0}),
             (0.245, 0.041, 0.041, {shoulder: 0.78, elbow: 0.22}),
@@ -55,7 +55,7 @@ def _arm(
     sides: tuple[int, ...] = LIMB,
 ) -> Piece:
     rings = [
-        on_arm(t, 0.0, -0.012 * max(1.0 - max(t, 0.0) / 0.1, 0.0), a, s, joints, left, 2.0, 0.4)
+        on_arm(t, 0.0, -0.008 * max(1.0 - max(t, 0.0) / 0.1, 0.0), a, s, joints, left, 2.0, 0.4)
         for t, a, s, joints in keys
     ]
     return Piece(coat, tuple(rings), sides, kept)

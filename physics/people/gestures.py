@@ -125,8 +125,8 @@ def _stopping(bends: Floats) -> dict[str, Arm]:
     _bend(bends, "neck", 0.0, 0.02, -0.10)
     _bend(bends, "right_collar", 0.0, 0.0, 0.18)
     o = np.zeros(FRAMES)
-    upper = np.column_stack([o + 1.0, o - 0.27, o + 0.03 + push])
-    fore = np.column_stack([o + 1.0, o - 0.22, o + 0.08 + push])
+    upper = np.column_stack([o + 1.0, o - 0.36, o + 0.02 + push])
+    fore = np.column_stack([o + 1.0, o - 0.32, o + 0.05 + push])
     return {
         "left": _hanging(1.0),
         "right": (upper, fore, np.array([-0.10, 0.0, 1.0]), np.array([0.0, 1.0, 0.0])),

@@ -95,9 +95,10 @@ def look(name: str, seed: int = 0) -> Look:
     family = family_of(name)
     choices = [outfit for outfit in OUTFITS[family] if _fits(outfit, name)]
     outfit = choices[_draw(name, seed, "outfit") % len(choices)]
+    skin = _pick(_SKINS, name, seed, "skin")
     colours = {
-        "skin": _pick(_SKINS, name, seed, "skin"),
-        "hair": _pick(_GREYS if family == "elder" else _HAIRS, name, seed, "hair"),
+        "skin": skin,
+        "hair": _pick(_GREYS if family == "elder" else _hairs(skin), name, seed, "hair"),
         "white": (206, 200, 194),
         "dark": (34, 28, 26),
         "top": _pick(_COATS if outfit.legs == "coat" else _TOPS, name, seed, "top"),
@@ -111,6 +112,11 @@ def look(name: str, seed: int = 0) -> Look:
     table = np.array([colours[coat] for coat in COATS], dtype=np.uint8)
     table.flags.writeable = False
     return Look(ALL.index(outfit), table, 0.022 * (_draw(name, seed, "girth") % 1001 / 1000.0) - 0.006)
+
+
+def _hairs(skin: Colour) -> tuple[str, ...]:
+    """Darker skins have darker hair."""
+    return _HAIRS if skin[0] > 0xB0 else _HAIRS[:3]
 
 
 def _fits(outfit: Outfit, name: str) -> bool:
