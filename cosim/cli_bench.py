@@ -1,0 +1,77 @@
+"""The command line of measurements: `cosim bench`."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+out = Console()
+err = Console(stderr=True)
+
+
+def bench(
+    what: Annotated[
+        Literal["environment", "camera"], typer.Argument(help="One environment process, or the cameras side by side.")
+    ] = "environment",
+    rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
+) -> None:
+    """Measure speed and memory of one environment process, part by part, or the speed of the cameras."""
+    if what == "camera":
+        bench_cameras(rounds)
+        return
+    from scenarios.bench import PARTS, measure, spread
+
+    with err.status("measuring ...") as status:
+        report = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
+    rows: list[tuple[str, list[float], str]] = [
+        ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
+        ("first frame of the cached city, s", report.first_frame_s, "<= 5"),
+        ("resident memory, MiB", [d.memory_mib for d in report.big], "<= 1024"),
+        ("cost of a step: 2 km / 0.5 km", report.growth(), "about 1"),
+        ("director's round trip, ms", [d.round_trip_ms for d in report.big], "<= 0.4"),
+        ("persons shown", [float(d.people) for d in report.big], ""),
+    ]
+    for name, values, target in rows:
+        table.add_row(name, *spread(values), target)
+    out.print(table)
+    parts = Table("part", "ms per simulated second", "spread", "share inside the engine")
+    for part in PARTS:
+        inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
+        parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
+    out.print(parts)
+    places = Table("2 km city", "median", "spread", "target")
+    places.add_row("seed to street map, s", *spread([p.made_s for p in report.places]), "<= 4")
+    places.add_row("cache to street map, s", *spread([p.read_s for p in report.places]), "<= 0.5")
+    places.add_row("point in walkable area, us", *spread([p.contains_us for p in report.places]), "<= 5")
+    places.add_row("distance to its edge, us", *spread([p.distance_us for p in report.places]), "<= 20")
+    places.add_row("shortest walk, ms", *spread([p.walk_ms for p in report.places]), "<= 2")
+    out.print(places)
+
+
+def bench_cameras(rounds: int) -> None:
+    """Measure the cameras in one busy street and print frames a second, targets and ratios."""
+    from physics.cameras import chosen, renderer_of
+    from scenarios.bench import spread
+    from scenarios.bench_cameras import FIGURES, PERSONS, RATIOS, SIZE, measure
+
+    drawn_by = renderer_of(chosen("auto"))
+    on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by
+    with err.status("measuring ...") as status:
+        found = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
+    table = Table(head, "frames/s", "spread", "target")
+    for figure in FIGURES:
+        least = figure.least_fps[on_gpu]
+        cells = spread(found[figure.name]) if found[figure.name] else ("cannot be drawn here", "")
+        table.add_row(figure.name, *cells, "" if least is None else f">= {least:,.4g}")
+    out.print(table)
+    ratios = Table("ratio", "median", "spread", "target")
+    for name, above, below, target in RATIOS:
+        values = [a / b for a, b in zip(found[above], found[below], strict=False)]
+        ratios.add_row(name, *(spread(values) if values else ("cannot be drawn here", "")), target)
+    out.print(ratios)
+    out.print(f"{drawn_by}; {rounds} rounds, medians", highlight=False)
