@@ -83,6 +83,11 @@ class Scene:
         self._movers = Things(context, self._forms, ("moving",))
         self._still_for: tuple[float, ...] | None = None
         self._shading: list[_Tile] = []
+        self._keys: list[Key] = []
+        self._stands_for: tuple[object, ...] | None = None
+        self._stands: Placed = _NOTHING
+        self._stands_xy: Floats = np.zeros((0, 2))
+        self._stands_seen_m: Floats = np.zeros(0)
         self._around: list[_Tile] = []
         self._in_view: list[_Tile] = []
         self._anchor: Floats = np.zeros(2)
@@ -96,7 +101,7 @@ class Scene:
         self._stream(view)
         self._show_people(shot, street)
         placed = [
-            *self._things(view),
+            self._things(view),
             *self._fences_now(),
             self._lamps(street),
             self._vehicles(view.rows(street.vehicles.xy, VEHICLE_MARGIN_M), street.vehicles),
@@ -164,6 +169,7 @@ class Scene:
         for key in keys:
             if key not in self._tiles:
                 self._tiles[key] = self._built(key)
+        self._keys = keys
         self._around = [self._tiles[key] for key in keys]
         middles = np.array([tile.middle for tile in self._around])
         self._in_view = [self._around[i] for i in _in_wedge(view, middles, _TILE_REACH_M)]
@@ -197,14 +203,21 @@ class Scene:
             ("prop", kind, variant), lambda: [Coat(part.mesh, part.colour) for part in parts_of(kind, variant)]
         )
 
-    def _things(self, view: View) -> list[Placed]:
+    def _things(self, view: View) -> Placed:
         """What stands in the tiles around, as far as it is drawn."""
-        placed = []
-        for tile in self._around:
-            rows = view.rows(tile.thing_xy, PROP_MARGIN_M)
-            rows = rows[np.hypot(*(tile.thing_xy[rows] - view.eye_m[:2]).T) < tile.seen_m[rows]]
-            placed.append(self._shifted(tile, rows))
-        return placed
+        around = (*sorted(self._keys), *self._anchor.tolist())
+        if around != self._stands_for:
+            tiles = [self._tiles[key] for key in sorted(self._keys)]
+            placed = [self._shifted(tile, np.arange(len(tile.thing_xy))) for tile in tiles]
+            self._stands = np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed])
+            self._stands_xy = np.concatenate([tile.thing_xy for tile in tiles])
+            self._stands_seen_m = np.concatenate([tile.seen_m for tile in tiles])
+            self._stands_for = around
+        rows = view.rows(self._stands_xy, PROP_MARGIN_M)
+        gap = np.hypot(*(self._stands_xy[rows] - view.eye_m[:2]).T)
+        rows = rows[gap < self._stands_seen_m[rows]]
+        form, things = self._stands
+        return form[rows], things[rows]
 
     def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> Placed:
         form, things = tile.things
