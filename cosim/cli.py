@@ -27,6 +27,7 @@ from rich.table import Column, Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
+from cosim.cli_events import kinds_of, print_by_kind, print_sheet
 from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
 from cosim.cli_live import checked_endpoint, inject, listen, replay
 from cosim.cli_map import map_app
@@ -71,6 +72,7 @@ COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
 @app.command(
     epilog="Examples:  \n"
     "`cosim run long-horizon --policy route --episodes 2`  \n"
+    "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`"
@@ -80,6 +82,7 @@ def run(
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
+    event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
@@ -117,7 +120,7 @@ def run(
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
         whole = shipped(suite)
-    picked = chosen(whole, scenario or (), episodes)
+    picked = chosen(whole, scenario or (), episodes, event or ())
     manifest = load_policy(policy).manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     spec = RunSpec(
@@ -167,6 +170,7 @@ def run(
             raise typer.Exit(130) from None
         table = held.finish()
     print_table(table, len(picked))
+    print_by_kind(out, table, kinds_of(path))
     out.print(f"Run folder: {path}", soft_wrap=True)
     if (table["status"] == "crashed").any():
         raise typer.Exit(1)
@@ -192,18 +196,25 @@ def list_all(
         return
     table = Table("scenario", "place", "route m", "crossings", "events", "barriers", "time limit s")
     for s in shipped(suite).scenarios:
-        cells = (f"{s.route_line.length_m:.0f}", len(s.crossings), len(s.events), len(s.barriers), s.time_limit_s)
+        events = s.events[0].kind if len(s.events) == 1 else len(s.events)
+        cells = (f"{s.route_line.length_m:.0f}", len(s.crossings), events, len(s.barriers), s.time_limit_s)
         table.add_row(s.id, s.place.name, *(f"{c:g}" if isinstance(c, float) else str(c) for c in cells))
     out.print(table)
 
 
-@app.command(epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --episode lh-011-00 -o episode.png`")
+@app.command(
+    epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --events`  \n"
+    "`cosim show runs/mine --episode lh-011-00 -o episode.png`"
+)
 def show(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
     episode: Annotated[str | None, typer.Option(help="One episode: its failures and events, and a picture.")] = None,
     picture: Annotated[
         Path | None, typer.Option("-o", "--output", help="Where to write the episode's picture.")
     ] = None,
+    events: Annotated[
+        bool, typer.Option("--events", help="What was measured of every event, from its tracks.")
+    ] = False,
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
     from cosim.results import table_of
@@ -211,8 +222,15 @@ def show(
 
     spec = read_spec(folder)
     records = {record.scenario: record for record in read_records(folder)}
+    if events:
+        if episode is not None:
+            raise UsageError("--events is about a whole run: leave --episode out")
+        print_sheet(out, folder)
+        return
     if episode is None:
-        print_table(table_of(records.values()), len(spec.scenarios))
+        table = table_of(records.values())
+        print_table(table, len(spec.scenarios))
+        print_by_kind(out, table, kinds_of(folder))
         return
     if episode not in records:
         from cosim.errors import unknown

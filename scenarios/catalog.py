@@ -11,7 +11,7 @@ from cosim.scenario import Scenario, Suite, read_suite
 
 _HERE = Path(__file__).parent / "suites"
 
-SUITES: Mapping[str, Path] = MappingProxyType({"long-horizon": _HERE / "long-horizon.json"})
+SUITES: Mapping[str, Path] = MappingProxyType({name: _HERE / f"{name}.json" for name in ("long-horizon",)})
 
 
 def suite(name: str) -> Suite:
@@ -26,11 +26,22 @@ def suite(name: str) -> Suite:
     return read_suite(SUITES[name])
 
 
-def chosen(whole: Suite, ids: Sequence[str] = (), episodes: int | None = None) -> tuple[Scenario, ...]:
-    """The named scenarios of a suite (all when none is named), the first `episodes` of them."""
+def chosen(
+    whole: Suite, ids: Sequence[str] = (), episodes: int | None = None, kinds: Sequence[str] = ()
+) -> tuple[Scenario, ...]:
+    """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.
+
+    Raises UsageError with the valid names.
+    """
     by_id = {scenario.id: scenario for scenario in whole.scenarios}
     for scenario_id in ids:
         if scenario_id not in by_id:
             raise unknown("scenario", scenario_id, by_id)
     picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
+    there = {event.kind: None for scenario in picked for event in scenario.events}
+    for kind in kinds:
+        if kind not in there:
+            raise unknown("event", kind, there)
+    if kinds:
+        picked = [s for s in picked if any(event.kind in kinds for event in s.events)]
     return tuple(picked[:episodes])

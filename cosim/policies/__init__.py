@@ -6,7 +6,10 @@ from collections.abc import Callable, Mapping
 from types import MappingProxyType
 
 from cosim.policies.baselines import Stop, Straight
+from cosim.policies.orca import Orca
 from cosim.policies.route import Route
 from cosim.ports import Policy
 
-POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType({"stop": Stop, "straight": Straight, "route": Route})
+POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
+    {"stop": Stop, "straight": Straight, "route": Route, "orca": Orca}
+)

@@ -38,6 +38,8 @@ STOP_SHORT_M = 0.9
 HALF_LENGTH_M = 0.35
 BODY_RADIUS_M = 0.33
 """The body as two disks, fore and aft."""
+CAR_RADIUS_M = 1.1
+"""A vehicle as three disks along its length."""
 
 CLEARANCE_M = 0.3
 TIGHT_M = 0.1
@@ -161,23 +163,27 @@ def obstacles(known: Privileged) -> tuple[Floats, Floats, Floats]:
 
     People near and not behind; on a crossing vehicles too, three disks each.
     """
-    pose = known.robot.pose
-    groups = [(known.people.xy, known.people.heading, known.people.speed, PERSON_RADIUS_M)]
-    if any(enter - 3.0 < known.route_s_m < leave for _, enter, leave in known.crossings):
-        cars = known.vehicles
-        along = np.column_stack([np.cos(cars.heading), np.sin(cars.heading)])
-        for part in (-0.35, 0.0, 0.35):
-            xy = cars.xy + part * cars.size[:, :1] * along
-            groups.append((xy, cars.heading, cars.speed, 1.1))
+    pose, people = known.robot.pose, known.people
+    cars_xy, cars_mps, cars_m = car_disks(known)
+    centres = np.concatenate([people.xy, cars_xy])
+    walks = (people.speed * np.array([np.cos(people.heading), np.sin(people.heading)])).T
+    velocities = np.concatenate([walks, cars_mps])
+    radii = np.concatenate([np.full(len(people), PERSON_RADIUS_M), cars_m])
+    offset = centres - pose.xy
     forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
-    centres, velocities, radii = [], [], []
-    for xy, heading, speed, radius in groups:
-        offset = xy - pose.xy
-        near = (np.hypot(offset[:, 0], offset[:, 1]) < SEEN_M) & (offset @ forward > -0.2)
-        centres.append(xy[near])
-        velocities.append((speed * np.array([np.cos(heading), np.sin(heading)])).T[near])
-        radii.append(np.full(int(near.sum()), radius))
-    return np.concatenate(centres), np.concatenate(velocities), np.concatenate(radii)
+    near = (np.hypot(offset[:, 0], offset[:, 1]) < SEEN_M) & (offset @ forward > -0.2)
+    return centres[near], velocities[near], radii[near]
+
+
+def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
+    """Vehicles as three disks each, as in `obstacles`; none away from crossings of the route."""
+    cars = known.vehicles
+    if not any(enter - 3.0 < known.route_s_m < leave for _, enter, leave in known.crossings):
+        return np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0)
+    along = np.column_stack([np.cos(cars.heading), np.sin(cars.heading)])
+    centres = np.concatenate([cars.xy + part * cars.size[:, :1] * along for part in (-0.35, 0.0, 0.35)])
+    velocities = np.tile((cars.speed * np.array([np.cos(cars.heading), np.sin(cars.heading)])).T, (3, 1))
+    return centres, velocities, np.full(len(centres), CAR_RADIUS_M)
 
 
 def plans(route: Polyline, s_m: float, lateral_m: float) -> Floats:
