@@ -9,9 +9,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
-import pandas as pd
 import typer
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import (
@@ -23,14 +21,14 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Column, Table
+from rich.table import Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
-from cosim.cli_events import kinds_of, print_by_kind, print_sheet
 from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
 from cosim.cli_live import checked_endpoint, inject, listen, replay
 from cosim.cli_map import map_app
+from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
 from cosim.errors import CosimError, UsageError
 
 app = typer.Typer(
@@ -56,17 +54,6 @@ app.command(epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
 app.command(epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
 out = Console()
 err = Console(stderr=True)
-
-SHOWN = (
-    ("success", "SR"),
-    ("route_completion", "RC"),
-    ("failures_per_100m", "FC"),
-    ("collisions_per_100m", "C"),
-    ("out_of_lane_per_100m", "OL"),
-    ("freezings_per_100m", "F"),
-    ("velocity_mean_mps", "V"),
-)
-COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
 
 
 @app.command(
@@ -169,7 +156,7 @@ def run(
             err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
             raise typer.Exit(130) from None
         table = held.finish()
-    print_table(table, len(picked))
+    print_table(out, table, len(picked))
     print_by_kind(out, table, kinds_of(path))
     out.print(f"Run folder: {path}", soft_wrap=True)
     if (table["status"] == "crashed").any():
@@ -229,7 +216,7 @@ def show(
         return
     if episode is None:
         table = table_of(records.values())
-        print_table(table, len(spec.scenarios))
+        print_table(out, table, len(spec.scenarios))
         print_by_kind(out, table, kinds_of(folder))
         return
     if episode not in records:
@@ -239,7 +226,7 @@ def show(
     from scenarios.picture import draw_episode
 
     record = records[episode]
-    print_episode(record)
+    print_episode(out, record)
     if record.status == "done":
         path = picture or folder / "episodes" / episode / "above.png"
         draw_episode(folder, episode, path)
@@ -298,57 +285,6 @@ class Board:
                 self.bars.remove_task(task)
             self.bars.advance(self._all)
             err.print(f"{message.scenario}: {message.status}")
-
-
-def print_table(table: pd.DataFrame, scheduled: int) -> None:
-    """The table of a run: a row per episode, then the means with their intervals."""
-    from cosim.results import summary_of
-
-    shown = Table(
-        Column("episode", no_wrap=True), "ended", *(head for _, head in SHOWN), "count C/OL/F", box=box.SIMPLE_HEAD
-    )
-    for _, row in table.iterrows():
-        counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
-        ended = row["ended"] if row["status"] == "done" else row["status"]
-        shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
-    out.print(shown)
-    if len(table):
-        means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
-        for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
-            interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
-            means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
-        out.print(means)
-    crashed = table[table["status"] == "crashed"]
-    invalid = table[table["status"] == "invalid"]
-    counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
-    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
-    for _, row in pd.concat([crashed, invalid]).iterrows():
-        out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
-
-
-def print_episode(record: object) -> None:
-    """One episode in words: how it ended, every failure, every event, every metric."""
-    from cosim.clock import Clock
-    from cosim.metrics import METRICS
-    from cosim.record import Record
-
-    assert isinstance(record, Record)
-    out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
-    for failure in record.failures:
-        what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
-        fault = f", {failure.fault}" if failure.fault else ""
-        out.print(f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
-    for event in record.events:
-        at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
-        out.print(f"  event {event.id} {event.kind}: {at}")
-    table = Table("metric", "value", "unit")
-    for name, metric in METRICS.items():
-        table.add_row(name, _cell(record.measures.get(name)), metric.unit)
-    out.print(table)
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None or pd.isna(value) else f"{value:.2f}"
 
 
 def main() -> None:

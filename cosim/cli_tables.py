@@ -1,0 +1,119 @@
+"""Tables of the command line: of a run, of its kinds of events, of one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.table import Column, Table
+
+from cosim.clock import Clock
+from cosim.metrics import METRICS
+from cosim.record import Record
+from cosim.results import interval_of, summary_of
+from cosim.scenario import Scenario, read_suite
+
+SHOWN = (
+    ("success", "SR"),
+    ("route_completion", "RC"),
+    ("failures_per_100m", "FC"),
+    ("collisions_per_100m", "C"),
+    ("out_of_lane_per_100m", "OL"),
+    ("freezings_per_100m", "F"),
+    ("velocity_mean_mps", "V"),
+)
+COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
+BY_KIND = (("success", "SR"), ("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"), ("rules_broken", "rules"))
+"""Means over the episodes of a kind of event."""
+
+
+def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
+    """The table of a run: a row per episode, then the means with their intervals."""
+    shown = Table(
+        Column("episode", no_wrap=True), "ended", *(head for _, head in SHOWN), "count C/OL/F", box=box.SIMPLE_HEAD
+    )
+    for _, row in table.iterrows():
+        counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
+        ended = row["ended"] if row["status"] == "done" else row["status"]
+        shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
+    out.print(shown)
+    if len(table):
+        means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
+        for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
+            interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+            means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
+        out.print(means)
+    crashed = table[table["status"] == "crashed"]
+    invalid = table[table["status"] == "invalid"]
+    counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
+    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
+    for _, row in pd.concat([crashed, invalid]).iterrows():
+        out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_episode(out: Console, record: Record) -> None:
+    """One episode in words: how it ended, every failure, every event, every metric."""
+    out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
+    for failure in record.failures:
+        what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
+        fault = f", {failure.fault}" if failure.fault else ""
+        out.print(f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
+    for event in record.events:
+        at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
+        out.print(f"  event {event.id} {event.kind}: {at}")
+    table = Table("metric", "value", "unit")
+    for name, metric in METRICS.items():
+        table.add_row(name, _cell(record.measures.get(name)), metric.unit)
+    out.print(table)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None or pd.isna(value) else f"{value:.2f}"
+
+
+def kinds_of(folder: Path) -> Mapping[str, str]:
+    """The kind of event that each scenario of a run is about; empty where they are about the way."""
+    return {s.id: s.events[0].kind for s in read_suite(folder / "scenarios.json").scenarios if about_one_event(s)}
+
+
+def about_one_event(scenario: Scenario) -> bool:
+    """Whether a scenario is there for its one event."""
+    return scenario.ends_on_failure and len(scenario.events) == 1
+
+
+def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
+    """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
+    if len(set(kinds.values())) < 2:
+        return
+    shown = Table("event", "n", *(head for _, head in BY_KIND), "95 % of SR", "invalid", "least m", box=box.SIMPLE_HEAD)
+    for kind in dict.fromkeys(kinds.values()):
+        part = table[table["scenario"].map(kinds) == kind]
+        values = {name: pd.to_numeric(part[name], errors="coerce").dropna() for name, _ in BY_KIND}
+        low, high = interval_of(values["success"].to_numpy(dtype=float))
+        nearest = pd.to_numeric(part["pedestrian_distance_min_m"], errors="coerce").min()
+        means = (f"{values[name].mean():.2f}" if len(values[name]) else "-" for name, _ in BY_KIND)
+        interval = f"{low:.2f} to {high:.2f}" if len(values["success"]) else "-"
+        invalid = str((part["status"] == "invalid").sum())
+        shown.add_row(kind, str(len(part)), *means, interval, invalid, "-" if pd.isna(nearest) else f"{nearest:.2f}")
+    out.print(shown)
+
+
+def print_sheet(out: Console, folder: Path) -> None:
+    """What was measured of each event of a run, and a summary by kind."""
+    from scenarios.eventsheet import sheet_of_run, summary
+
+    sheet = sheet_of_run(folder)
+    heads = ("trigger m", "error", "tick", "m/s", "stated", "left m", "angle", "least m")
+    rows = Table(Column("episode", no_wrap=True), "event", *heads, box=box.SIMPLE_HEAD)
+    for row in sheet.itertuples(index=False):
+        numbers = (f"{value:.3f}" if i in (1, 2) else f"{value:.2f}" for i, value in enumerate(row[2:]))
+        rows.add_row(row[0], row[1], *("-" if n == "nan" else n for n in numbers))
+    out.print(rows)
+    short = summary(sheet)
+    table = Table(*short.columns, box=box.SIMPLE_HEAD)
+    for row in short.itertuples(index=False):
+        table.add_row(*(str(value) for value in row))
+    out.print(table)
