@@ -1,8 +1,8 @@
 """Optimal reciprocal collision avoidance: velocities that keep a disk clear of others for a time.
 
 Source: J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avoidance", Robotics Research (ISRR
-2009), Springer 2011; its sections and equations are named below. The linear programme is theirs too (section 5), after
-de Berg et al., "Computational Geometry", chapter 4.
+2009), Springer 2011; the names are its own. The linear programme is theirs too, after de Berg et al., "Computational
+Geometry", chapter 4 (linear programming).
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class HalfPlane(NamedTuple):
 def half_plane(
     apart_m: Floats, mine_mps: Floats, other_mps: Floats, radius_m: float, horizon_s: float, share: float, step_s: float
 ) -> HalfPlane:
-    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau (equation 6).
+    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the paper.
 
     apart_m (2,): from me to the other; mine_mps, other_mps (2,): velocities; radius_m: sum of both radii; horizon_s:
     tau; share: of the avoidance that is mine, 1/2 where both avoid, 1 where the other does not; step_s: time in which
     disks that overlap already are to be parted.
 
-    The velocity obstacle VO^tau (equation 2) is the cone of relative velocities that lead into the disk of radius
+    The velocity obstacle VO^tau is the cone of relative velocities that lead into the disk of radius
     `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs that touch it. u is the
     smallest change of the relative velocity that reaches the obstacle's boundary, n its outward normal there.
     """
@@ -67,9 +67,9 @@ def half_plane(
 
 
 def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mps: float) -> Floats:
-    """The permitted velocity (2,) nearest to the preferred one (equation 7), no faster than `fastest_mps`.
+    """The permitted velocity (2,) nearest to the preferred one, no faster than `fastest_mps`.
 
-    Where the half-planes leave none, the one that violates the worst of them least (section 5.3).
+    Where the half-planes leave none ("densely packed conditions"), the one that violates the worst of them least.
     """
     speed = math.hypot(*preferred_mps)
     v = preferred_mps * min(1.0, fastest_mps / max(speed, EPS))

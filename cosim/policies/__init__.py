@@ -8,8 +8,9 @@ from types import MappingProxyType
 from cosim.policies.baselines import Stop, Straight
 from cosim.policies.orca import Orca
 from cosim.policies.route import Route
+from cosim.policies.social_force import SocialForce
 from cosim.ports import Policy
 
 POLICIES: Mapping[str, Callable[[], Policy]] = MappingProxyType(
-    {"stop": Stop, "straight": Straight, "route": Route, "orca": Orca}
+    {"stop": Stop, "straight": Straight, "route": Route, "orca": Orca, "social_force": SocialForce}
 )

@@ -1,0 +1,64 @@
+"""Social forces: against the potential that they are the slope of, and on cases seen at a glance."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from cosim.geometry import Polyline, Pose
+from cosim.policies.social_force import DESIRED_MPS, RELAXATION_S, force, from_edge, from_people, seen
+from cosim.ports import Privileged
+from cosim.state import NO_VEHICLES, NOBODY, People, RobotState
+
+
+def walker(x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> People:
+    return People.of(("c0",), [(x_m, y_m)], [heading_rad], [speed_mps], ("walk",))
+
+
+def potential(people: People, here: np.ndarray) -> float:
+    """V0 exp(-b / sigma) with the paper's b."""
+    away = here - people.xy[0]
+    step = 2.0 * people.speed[0] * np.array([math.cos(people.heading[0]), math.sin(people.heading[0])])
+    both = math.hypot(*away) + math.hypot(*(away - step))
+    return 2.1 * math.exp(-0.5 * math.sqrt(both**2 - float(step @ step)) / 0.3)
+
+
+@pytest.mark.parametrize("here", [(0.0, 0.0), (1.5, 0.6), (2.2, -0.8)])
+def test_a_push_is_minus_the_slope_of_the_potential(here: tuple[float, float]) -> None:
+    """Differences of the potential over a thousandth of a metre agree with the push."""
+    person, at, h = walker(2.0, 0.3, 2.8, 1.3), np.array(here), 1e-3
+    slope = [
+        (potential(person, at + h * axis) - potential(person, at - h * axis)) / (2 * h)
+        for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
+    ]
+    assert from_people(person, at)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
+
+
+def test_what_happens_behind_counts_half() -> None:
+    """A push from ahead is felt whole, one from behind by half."""
+    pushes = np.array([[-1.0, 0.0], [1.0, 0.0]])
+    assert seen(pushes, np.array([1.0, 0.0])).tolist() == [[-1.0, 0.0], [0.5, 0.0]]
+
+
+def scene(y_m: float, others: People = NOBODY) -> Privileged:
+    """A robot at rest beside a route along the x axis, on a walkway free 1.5 m to either side of it."""
+    robot = RobotState(Pose(5.0, y_m, 0.0), 0.0)
+    route = Polyline([(0.0, 0.0), (30.0, 0.0)])
+    return Privileged(robot, route, 5.0, others, NO_VEHICLES, {}, (), box(-5.0, -1.5, 35.0, 1.5))
+
+
+def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
+    """On the middle the goal pulls with v0 / tau; near the left edge the push is to the right, beyond it stronger."""
+    assert force(scene(0.0), np.zeros(2))[0] == pytest.approx(DESIRED_MPS / RELAXATION_S, rel=1e-3)
+    near, beyond = from_edge(scene(1.3), np.array([5.0, 1.3])), from_edge(scene(1.6), np.array([5.0, 1.6]))
+    assert near[0] == pytest.approx(0.0, abs=1e-9) and near[1] < 0.0
+    assert beyond[1] < near[1]
+
+
+def test_somebody_who_comes_from_ahead_on_the_left_pushes_back_and_to_the_right() -> None:
+    """A walker 2 m ahead, 0.3 m left, coming closer."""
+    alone, met = (force(scene(0.0, people), np.zeros(2)) for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3)))
+    assert met[0] < alone[0] and met[1] < alone[1] - 0.1
