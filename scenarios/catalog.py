@@ -11,7 +11,7 @@ from cosim.scenario import Scenario, Suite, read_suite
 
 _HERE = Path(__file__).parent / "suites"
 
-SUITES: Mapping[str, Path] = MappingProxyType({name: _HERE / f"{name}.json" for name in ("long-horizon",)})
+SUITES: Mapping[str, Path] = MappingProxyType({name: _HERE / f"{name}.json" for name in ("long-horizon", "reactive")})
 
 
 def suite(name: str) -> Suite:

@@ -52,7 +52,8 @@ def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, 
     """The rows of an episode.
 
     trigger_m: metres along the route from the robot to the event's place at the trigger. error_m: how much that is
-    less than stated. period_m: what the robot drove then in a tick, the most that the error may be. speed_mps: median
+    less than stated. period_m: what the robot drove then in a tick, or came forward on its route (it may cut a
+    bend of it), the most that the error may be. speed_mps: median
     while walking (absent for who never walks); stated_mps: of the spec. left_m: how far left of the way's middle it
     stood or walked, most of the time. angle_deg: of its walk to the robot's heading at the trigger, -180 to 180.
     least_m: least distance of its centre from the robot's.
@@ -66,7 +67,8 @@ def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, 
         before = max(first - 1, 0)
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
         stated_m = TRIGGERS_M.get(event.kind, event.half_length_m)
-        period_m = float(log.travelled_m[before])
+        came_m = float(log.route_s_m[before] - log.route_s_m[before - 1]) if before else 0.0
+        period_m = max(float(log.travelled_m[before]), came_m)
         for person in range(event.people):
             track = tracks[tracks[:, 2] == person]
             name = scenario.id if event.people == 1 else f"{scenario.id} {person + 1}"

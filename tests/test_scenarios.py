@@ -14,8 +14,10 @@ from shapely.geometry import LineString, Point, Polygon, box
 
 from cosim.clock import Clock
 from cosim.control import Limits
-from cosim.errors import SpecError
+from cosim.errors import SpecError, UsageError
+from cosim.events import EventQuery
 from cosim.geometry import Polyline
+from cosim.loop import query
 from cosim.policies import POLICIES
 from cosim.ports import Privileged
 from cosim.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
@@ -23,13 +25,13 @@ from cosim.state import NO_VEHICLES, NOBODY, RobotState
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.walks import WalkGraph
 from scenarios.barriers import barrier_at, branches, fenced, prove_single_path
-from scenarios.behaviors import BEHAVIORS
+from scenarios.behaviors import BEHAVIORS, react
 from scenarios.build import Proof
-from scenarios.catalog import SUITES, suite
+from scenarios.catalog import SUITES, chosen, suite
 from scenarios.long_horizon import build, on_road_m
 from sumo_nets.mapstore import read_map
 
-SCENARIOS = [scenario for name in SUITES for scenario in suite(name).scenarios]
+LONG = suite("long-horizon").scenarios
 
 
 def test_the_long_horizon_suite_is_what_it_promises() -> None:
@@ -37,13 +39,52 @@ def test_the_long_horizon_suite_is_what_it_promises() -> None:
     whole = suite("long-horizon")
     assert len(whole.scenarios) >= 10
     assert len({s.place.name for s in whole.scenarios}) >= 3
-    proofs = msgspec.json.decode(SUITES["long-horizon"].with_suffix(".proof.json").read_bytes(), type=list[Proof])
-    proved = {proof.scenario: proof.scenario_hash for proof in proofs}
-    assert proved == {s.id: content_hash(s) for s in whole.scenarios}
     for scenario in whole.scenarios:
         assert scenario.route_line.length_m > 100.0
         assert scenario.time_limit_s == max(300.0, scenario.route_line.length_m / 0.2)
         assert scenario.crossings and scenario.place.net_hash
+
+
+def test_the_reactive_suite_is_what_it_promises() -> None:
+    """Each event in twenty cities, one each; 10 to 20 m of way; nothing triggers where the robot starts."""
+    whole = suite("reactive")
+    cities = {scenario.place.name for scenario in whole.scenarios}
+    assert len(cities) == 20
+    places = {kind: [s.place.name for s in whole.scenarios if s.events[0].kind == kind] for kind in BEHAVIORS}
+    assert all(len(there) == 20 and set(there) == cities for there in places.values())
+    assert [s.place.name for s in whole.scenarios] == sorted(
+        (s.place.name for s in whole.scenarios), key=lambda name: int(name.rpartition("-")[2])
+    )
+    for scenario in whole.scenarios:
+        (event,) = scenario.events
+        assert 10.0 <= scenario.route_line.length_m <= 20.5
+        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == (event.kind == "gesturing")
+        assert 1.1 <= event.speed_mps <= 1.65
+        states = react(first_query(scenario)).states
+        assert states[0].phase == "waiting"
+
+
+def first_query(scenario: Scenario) -> EventQuery:
+    """What a director is asked at the first tick."""
+    return query(scenario, Clock(), 0, RobotState(scenario.start_pose), 0.0, (0.7, 0.55), ())
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_scenario_comes_with_its_proof(name: str) -> None:
+    """The proofs beside a suite are of these very scenarios."""
+    proofs = msgspec.json.decode(SUITES[name].with_suffix(".proof.json").read_bytes(), type=list[Proof])
+    assert {proof.scenario: proof.scenario_hash for proof in proofs} == {
+        s.id: content_hash(s) for s in suite(name).scenarios
+    }
+
+
+def test_scenarios_are_chosen_by_event() -> None:
+    """All with an event of the kinds asked for; a kind that is not there is answered with those that are."""
+    whole = suite("reactive")
+    assert {s.events[0].kind for s in chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
+    assert [s.events[0].kind for s in chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
+    with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
+        chosen(whole, kinds=["ambush"])
 
 
 def test_a_suite_survives_its_file(tmp_path: Path) -> None:
@@ -97,7 +138,7 @@ def test_free_space_ends_at_furniture() -> None:
 
 
 @pytest.mark.engine
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda s: s.id)
+@pytest.mark.parametrize("scenario", LONG, ids=lambda s: s.id)
 def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
     """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
     from scenarios.assemble import place
