@@ -40,7 +40,8 @@ class Kind:
 
     sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how many a street of a
     class has along 100 m of one sidewalk. row: stands in a row, evenly spaced. spread_m: radius of what is above
-    the heads and may hang over a sidewalk, not into a house. seen_m: farthest it is drawn.
+    the heads and may hang over a sidewalk, not into a house. seen_m: farthest it is drawn. grown: its parts differ
+    from paint to paint.
     """
 
     name: str
@@ -48,11 +49,12 @@ class Kind:
     zones: tuple[Zone, ...]
     per_100m: Mapping[str, float]
     solids: Callable[[Size], tuple[Solid, ...]]
-    parts: Callable[[Size], tuple[Part, ...]]
+    parts: Callable[..., tuple[Part, ...]]
     paints: tuple[Colour, ...]
     row: bool = False
     spread_m: float = 0.0
     seen_m: float = 30.0
+    grown: bool = False
 
     def size_m(self, variant: int) -> Size:
         low, high = np.array(self.sizes_m)
@@ -78,7 +80,7 @@ CATALOGUE: Final[tuple[Kind, ...]] = (
     ),
     Kind(
         "tree", ((0.2, 0.2, 4.6), (0.4, 0.4, 7.5)), ("verge", "frontage"), _along(5.0, 2.5, 4.5, 7.0, 0.0),
-        shapes.upright, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0,
+        shapes.upright, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0, grown=True,
     ),
     Kind(
         "lamp", ((0.12, 0.12, 4.5), (0.16, 0.16, 7.0)), ("verge", "curb", "frontage"), _along(3.0, 4.0, 3.6, 3.6, 2.5),
@@ -136,7 +138,10 @@ KINDS: Final[Mapping[str, Kind]] = {kind.name: kind for kind in CATALOGUE}
 
 @dataclass(frozen=True, slots=True)
 class Prop:
-    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's paints."""
+    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's paints.
+
+    turned_rad: what is drawn of it is turned further by so much; what is bumped into is not.
+    """
 
     id: str
     kind: str
@@ -145,10 +150,21 @@ class Prop:
     y_m: float
     heading_rad: float
     paint: int
+    turned_rad: float = 0.0
 
     @property
     def size_m(self) -> Size:
         return KINDS[self.kind].size_m(self.variant)
+
+    @property
+    def form(self) -> tuple[str, int, int]:
+        """What `parts_of` takes: props with equal forms are drawn with the same meshes."""
+        return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
+
+    @property
+    def drawn_rad(self) -> float:
+        """Heading of what is drawn."""
+        return self.heading_rad + self.turned_rad
 
 
 def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:
@@ -165,10 +181,11 @@ def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.objec
 
 
 @cache
-def parts_of(kind: str, variant: int) -> tuple[Part, ...]:
-    """What is drawn of a prop."""
+def parts_of(kind: str, variant: int, look: int = 0) -> tuple[Part, ...]:
+    """What is drawn of a prop. look: tells apart those of one size, where a kind is `grown`."""
     entry = KINDS[kind]
-    return entry.parts(entry.size_m(variant))
+    size = entry.size_m(variant)
+    return entry.parts(size, look) if entry.grown else entry.parts(size)
 
 
 @cache

@@ -6,13 +6,15 @@ prop's size and makes about sixty triangles at most, because the software render
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
 
 from cosim.geometry import Floats
-from physics.mesh import Mesh, box, frustum, join
+from physics.mesh import Mesh, box, disc, frustum, join
+from physics.tree_shapes import SPECIES, crown, trunk
 from physics.vehicles import vehicle_parts
 
 Colour = tuple[float, float, float]
@@ -45,10 +47,13 @@ class Solid:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A mesh of one colour; None is the prop's own paint."""
+    """A mesh of one colour; None is the prop's own paint. What only some cameras show: cover, a layer of
+    physics.textures.walls that takes the colour ("": none); shade: (V,) light that reaches each corner, 0 to 1."""
 
     mesh: Mesh
     colour: Colour | None
+    cover: str = ""
+    shade: Floats | None = None
 
 
 def upright(size: Size) -> tuple[Solid, ...]:
@@ -83,14 +88,30 @@ def hoops(size: Size) -> tuple[Solid, ...]:
 
 def lamp(size: Size) -> tuple[Part, ...]:
     r, h = 0.5 * size[0], size[2]
-    pole = [frustum((r, r), (0.5 * r, 0.5 * r), 0.0, h, 5), box((0.06, 1.1, 0.06), (0.0, 0.5, h))]
-    return Part(join(pole), None), Part(box((0.2, 0.5, 0.1), (0.0, 1.1, h - 0.04)), LIGHT)
+    pole = [
+        frustum((r, r), (0.9 * r, 0.9 * r), 0.0, 0.8, 8),
+        frustum((0.6 * r, 0.6 * r), (0.4 * r, 0.4 * r), 0.8, h - 0.02, 6),
+        box((0.06, 1.3, 0.06), (0.0, 0.6, h - 0.03)),
+        box((0.22, 0.6, 0.05), (0.0, 1.3, h + 0.02)),
+    ]
+    glass = box((0.18, 0.52, 0.06), (0.0, 1.3, h - 0.035), skip=("top",))
+    return Part(join(pole), None, "metal-painted"), Part(glass, LIGHT, "lamp")
 
 
 def sign(size: Size) -> tuple[Part, ...]:
+    """A plate on a pole, its face to the oncoming traffic, its back bare metal: a square, a disc or a triangle."""
     h = size[2]
-    pole = box((0.06, 0.06, h), (0.0, 0.0, 0.5 * h), skip=("bottom",))
-    return Part(pole, METAL), Part(box((0.03, 0.5, 0.5), (0.045, 0.0, h - 0.28)), None)
+    pole = frustum((0.03, 0.03), (0.03, 0.03), 0.0, h, 6)
+    shape = ((4, 0.25 * math.pi), (14, 0.0), (3, 0.0))[round(100.0 * size[0]) % 3]
+    middle, radius = (-0.040, 0.0, h - 0.31), 0.30 if shape[0] > 4 else 0.34
+    back = disc(radius, (0.0, 0.0, 0.0), *shape).moved((0.004, 0.0, 0.0))
+    rim, face = disc(radius, (0.0, 0.0, 0.0), *shape), disc(0.86 * radius, (0.0, 0.0, 0.0), *shape)
+    turn = [disc_.moved((0.0, 0.0, 0.0), math.pi) for disc_ in (rim, face)]
+    return (
+        Part(join([pole, back.moved(middle)]), METAL, "metal-brushed"),
+        Part(turn[0].moved(middle), WHITE),
+        Part(turn[1].moved((middle[0] - 0.006, middle[1], middle[2])), None),
+    )
 
 
 def hydrant(size: Size) -> tuple[Part, ...]:
@@ -102,45 +123,46 @@ def hydrant(size: Size) -> tuple[Part, ...]:
 
 def litter_bin(size: Size) -> tuple[Part, ...]:
     r, h = 0.5 * size[0], size[2]
-    lid = frustum((r, r), (0.7 * r, 0.7 * r), 0.88 * h, h, 8)
-    return Part(frustum((0.82 * r, 0.82 * r), (0.95 * r, 0.95 * r), 0.0, 0.88 * h, 8), None), Part(lid, DARK)
+    foot = frustum((0.7 * r, 0.7 * r), (0.7 * r, 0.7 * r), 0.0, 0.08, 8)
+    lid = [
+        frustum((r, r), (0.6 * r, 0.6 * r), 0.92 * h, h, 8),
+        frustum((0.8 * r, 0.8 * r), (0.8 * r, 0.8 * r), 0.8 * h, 0.92 * h, 8),
+    ]
+    drum = frustum((0.85 * r, 0.85 * r), (0.95 * r, 0.95 * r), 0.08, 0.8 * h, 8)
+    return Part(drum, None, "metal-painted"), Part(join([foot, *lid]), DARK)
 
 
 def bench(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
-    slats = [
-        box((length, depth - 0.1, 0.06), (0.0, -0.05, 0.45)),
-        box((length, 0.05, 0.3), (0.0, 0.5 * depth - 0.05, h - 0.15)),
-    ]
+    slats = [box((length, 0.25 * depth, 0.05), (0.0, y * depth, 0.45), skip=("bottom",)) for y in (-0.35, -0.05, 0.25)]
+    slats += [box((length, 0.04, 0.12), (0.0, 0.5 * depth - 0.05, h - z), skip=("bottom",)) for z in (0.06, 0.24)]
     legs = [box((0.06, depth, 0.42), (s * (0.5 * length - 0.2), 0.0, 0.21), skip=("bottom", "top")) for s in (-1, 1)]
     legs += [
         box((0.06, 0.05, h - 0.42), (s * (0.5 * length - 0.2), 0.5 * depth - 0.03, 0.5 * (h + 0.3)), skip=("top",))
         for s in (-1, 1)
     ]
-    return Part(join(slats), None), Part(join(legs), METAL)
+    return Part(join(slats), None, "planks"), Part(join(legs), METAL)
 
 
-def tree(size: Size) -> tuple[Part, ...]:
-    r, h = 0.5 * size[0], size[2]
-    crown, clear = 0.24 * h, max(0.42 * h, 2.2)
-    wide = 0.5 * (clear + h)
-    trunk = frustum((r, r), (0.6 * r, 0.6 * r), 0.0, clear + 0.3, 6)
-    low = frustum((0.35 * crown, 0.35 * crown), (crown, crown), clear, wide, 7)
-    high = frustum((crown, crown), (0.35 * crown, 0.4 * crown), wide, h, 7)
-    return Part(trunk, BARK), Part(join([low, high]), None)
+def tree(size: Size, look: int) -> tuple[Part, ...]:
+    """look: which species."""
+    species = SPECIES[look % len(SPECIES)]
+    leaves = crown(species, size[2])
+    stem = trunk(species, size[2], 0.5 * size[0])
+    return Part(stem, BARK, "bark"), Part(leaves.mesh, None, species.cover, leaves.shade)
 
 
 def planter(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     tub = box((length, depth, 0.55 * h), (0.0, 0.0, 0.275 * h), skip=("bottom",))
     wide, narrow = (0.46 * length, 0.46 * depth), (0.3 * length, 0.25 * depth)
-    return Part(tub, STONE), Part(frustum(wide, narrow, 0.55 * h, h, 6), None)
+    return Part(tub, STONE, "stone"), Part(frustum(wide, narrow, 0.55 * h, h, 8), None, "hedge")
 
 
 def bollard(size: Size) -> tuple[Part, ...]:
     r, h = 0.5 * size[0], size[2]
     post, band = frustum((r, r), (0.85 * r, 0.85 * r), 0.0, h, 6), frustum((r, r), (r, r), 0.78 * h, 0.9 * h, 6)
-    return Part(post, None), Part(band, BANDS)
+    return Part(post, None, "metal-painted"), Part(band, BANDS)
 
 
 def rack(size: Size) -> tuple[Part, ...]:
@@ -149,7 +171,7 @@ def rack(size: Size) -> tuple[Part, ...]:
     for x in _hoops_at(size[0]).tolist():
         bars += [box((0.05, 0.05, h), (x, s * (0.5 * depth - 0.03), 0.5 * h), skip=("bottom", "top")) for s in (-1, 1)]
         bars.append(box((0.05, depth, 0.05), (x, 0.0, h - 0.025), skip=("bottom", "left", "right")))
-    return (Part(join(bars), None),)
+    return (Part(join(bars), None, "metal-brushed"),)
 
 
 def scooter(size: Size) -> tuple[Part, ...]:

@@ -80,7 +80,10 @@ def _prop(number: int, feature: Feature) -> Prop:
     if feature.height_m > 0.0:
         variant = min(range(VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
     paint = drawn // VARIANTS % len(kind.paints)
-    return Prop(f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint)
+    turned = number % 7 * 0.9 if kind.grown else 0.0
+    return Prop(
+        f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint, turned
+    )
 
 
 def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:

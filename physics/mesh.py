@@ -133,3 +133,12 @@ def frustum(
         np.concatenate([outward, outward, np.tile([0.0, 0.0, 1.0], (sides, 1))]),
         np.concatenate([side, top]).astype(np.int32),
     )
+
+
+def disc(radius_m: float, centre_m: Sequence[float], sides: int, turn_rad: float = 0.0) -> Mesh:
+    """An upright regular polygon that faces +x, its first corner above unless it is turned."""
+    angle = 0.5 * np.pi + turn_rad + 2.0 * np.pi * np.arange(sides) / sides
+    at = np.column_stack([np.zeros(sides), radius_m * np.cos(angle), radius_m * np.sin(angle)]) + np.asarray(centre_m)
+    k = np.arange(1, sides - 1)
+    triangles = np.stack([np.zeros_like(k), k, k + 1], axis=1).astype(np.int32)
+    return Mesh(at, np.tile([1.0, 0.0, 0.0], (sides, 1)), triangles)

@@ -35,6 +35,9 @@ GAP_M: Final = 0.25
 _EDGE_M: Final = 0.6
 """The outer edge of a wide sidewalk that props at the curb may use."""
 
+GOLDEN_RAD: Final = 2.399963
+"""Each tree is turned by so much more than the one before: no two look alike."""
+
 _MARGIN_M: Final = 0.06
 _VERGE_MIN_M: Final = 0.3
 _ZONE_MAX_M: Final = 6.0
@@ -175,7 +178,12 @@ def _stood(
     away = band.low_m + 0.5 * depth + share * slack
     heading = along + (0.5 * math.pi if turned else 0.0 if zone in ("frontage", "driveway") else math.pi)
     x, y = x - away * math.sin(along), y + away * math.cos(along)
-    return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint)
+    further = 0.0
+    if kind.name == "lamp" and zone == "frontage":
+        further = math.pi  # its arm reaches over the sidewalk and the road, not into the houses
+    elif kind.grown:
+        further = GOLDEN_RAD * n
+    return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint, further)
 
 
 def zones(strip: Strip) -> dict[Zone, _Band]:

@@ -54,7 +54,7 @@ class Scene:
         self._walkers = {family: Rigs(canvas, part_meshes(family), "person") for family in FAMILIES}
         self._lamps = {walk: Rigs(canvas, [props.lamp_mesh(walk)], "signal") for walk in props.LAMPS}
         self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
-        self._furniture: dict[tuple[str, int], Rigs] = {}
+        self._furniture: dict[tuple[str, int, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
         self._robot = canvas.load(model.urdf, "robot")
         for barrier in barriers:
@@ -182,12 +182,12 @@ class Scene:
             gap = np.hypot(*(tile.furniture_xy[rows] - view.eye_m[:2]).T)
             for i in rows[gap < tile.seen_m[rows]].tolist():
                 prop, z = tile.furniture[i]
-                form = prop.kind, prop.variant
+                form = prop.form
                 parts = parts_of(*form)
                 if form not in self._furniture:
                     self._furniture[form] = Rigs(self._canvas, [part.mesh for part in parts], "prop")
                 for body, part in zip(self._furniture[form].lend(), parts, strict=True):
-                    self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.heading_rad)
+                    self._canvas.put(body, (prop.x_m, prop.y_m, z), prop.drawn_rad)
                     colour = part.colour or KINDS[prop.kind].paints[prop.paint]
                     if self._painted.get(body) != colour:
                         self._painted[body] = colour

@@ -12,7 +12,7 @@ import pytest
 from cosim.errors import SpecError, UsageError
 from physics.materials import PAVINGS
 from physics.textures.bonds import basket, courses, herringbone
-from physics.textures.facades import VARIANTS, WALL_STYLES, facade_layers
+from physics.textures.facades import DOORS, STREETS, VARIANTS, WALL_STYLES, facade_layers
 from physics.textures.ground import GROUND, SURFACE_LAYERS, ground_layers, layer_of
 from physics.textures.layers import Layers, encoded, joined, linear
 from physics.textures.noise import Noise, cells
@@ -72,7 +72,10 @@ def test_every_name_in_the_tables_is_a_layer() -> None:
     walls, facades = set(wall_layers(256).names), set(facade_layers(256).names)
     for style in WALL_STYLES.values():
         assert {*style.walls, *style.roofs} <= walls
-        assert {f"{name}-{k}" for name in (*style.uppers, *style.fronts) for k in range(VARIANTS)} <= facades
+        fronts = {bay for name in style.fronts for bay in (DOORS[name].between, DOORS[name].door)}
+        assert {f"{name}-{k}" for name in (*style.uppers, *fronts) for k in range(VARIANTS)} <= facades
+    assert all(1 <= front.every <= 15 for front in DOORS.values())
+    assert {name for names in STREETS.values() for name in names} <= set(WALL_STYLES)
     for surface in (*SURFACES, *PAVINGS):
         assert (
             layer_of(surface) in SURFACE_LAYERS[surface.split(":")[1] if ":" in surface else surface]

@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pytest
 import shapely
 
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from physics.buildings import Frontage
+from physics.frontage import frontage_in
 from physics.paint import paint_in
 from physics.tiles import CURB_M, TILE_M, Tile, build_tile, distance_to, key_at, keys_within, square
 
@@ -180,3 +182,29 @@ def test_paint_lies_on_its_ground() -> None:
             assert above.min() > 0.003 and above.max() < 0.005
             found[name] = found.get(name, 0) + len(mesh)
     assert found["tactile-domes"] >= 4 and found["paint"] >= 20
+
+
+def test_the_frontage_is_paved_where_there_are_shops() -> None:
+    """Before shops it is covered from the sidewalk to the houses, without holes or doubles, a little above the ground;
+    a home's driveway reaches from its sidewalk to the houses; the ground itself stays what it was."""
+    changed = {
+        "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
+        "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
+    }
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, _trees={})
+    covered, layers = [], set()
+    for key in KEYS:
+        tile = build_tile(street_map, key)
+        assert set(tile.parts) - {"ramp"} == set(TILES[key].parts) - {"ramp"}
+        for mesh, cover in frontage_in(street_map, tile, 3):
+            layers.add(cover.layer)
+            above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
+            assert above.min() > 0.002 and above.max() < 0.004
+            covered.append(shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2]))
+    pieces = np.concatenate(covered)
+    whole = shapely.union_all(pieces, grid_size=1e-6)
+    assert shapely.area(pieces).sum() == pytest.approx(whole.area, rel=1e-4)
+    assert whole.covers(shapely.box(-55.0, 6.51, -3.0, 8.49))
+    assert whole.covers(shapely.box(30.6, 6.51, 33.4, 8.49))
+    assert whole.intersection(shapely.box(-55.0, -8.0, 55.0, 6.45)).area < 1e-6
+    assert len(layers) >= 2

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from physics.mesh import Mesh
 
@@ -19,8 +19,8 @@ LAYOUT: Final = ("3f 4f1 4f1", "in_at", "in_normal", "in_colour")
 Rows = NDArray[np.void]
 
 
-def corners(mesh: Mesh, colour: Sequence[float], fourth: int) -> Rows:
-    """(V,) rows of CORNER. colour: rgb from 0 to 1; fourth: what goes beside it."""
+def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> Rows:
+    """(V,) rows of CORNER. colour: rgb from 0 to 1, (3,) or (V, 3); fourth: what goes beside it."""
     rows = np.zeros(len(mesh.vertices), dtype=CORNER)
     rows["at"], rows["normal"][:, :3] = mesh.vertices, np.rint(127.0 * mesh.normals) + 127.0
     rows["colour"][:, :3], rows["colour"][:, 3] = np.rint(255.0 * np.asarray(colour)), fourth

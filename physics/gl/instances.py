@@ -13,8 +13,10 @@ import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from cosim.geometry import Floats
 from physics.gl.corners import LAYOUT, Rows, corners, joined
 from physics.gl.shading import Stage, programs
+from physics.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.mesh import Mesh
 
 Colour = tuple[float, float, float]
@@ -23,45 +25,76 @@ INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 
 """at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its fourth."""
 
 _OWN, _PAINT, _GLOW = 255, 0, 128
-"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining."""
+"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining. Where it is not its own
+the colour says how much light reaches the corner."""
+_BARE, _LAMP = 255, 254
+"""Fourth channel of a corner's normal, if not a layer of the surfaces: nothing lies on it, or it shines at night."""
+_LAMPLIGHT: Final = "6.0e-3, 4.8e-3, 3.0e-3"
+"""Radiance of a street lamp's glass as far as a camera is to see it, in the units of physics.sky."""
 
-_VERTEX: Final = """
+_VERTEX: Final = f"""
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
 in vec3 thing_at; in vec4 thing_turn; in vec4 thing_paint;
-out vec3 at; out vec3 normal; out vec3 albedo; flat out float label; flat out float shines;
-vec3 turned(vec3 v) { return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }
-void main() {
+out vec3 at; out vec3 normal; out vec3 albedo; out vec3 spot; out vec3 side;
+flat out float label; flat out float shines; flat out float cover;
+vec3 turned(vec3 v) {{ return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }}
+void main() {{
     at = thing_at + turned(in_at);
-    normal = turned(unpacked(in_normal));
-    albedo = in_colour.a > 0.75 ? in_colour.rgb : thing_paint.rgb;
-    shines = (in_colour.a > 0.25 && in_colour.a < 0.75) ? 1.0 : 0.0;
+    side = unpacked(in_normal);
+    normal = turned(side);
+    bool own = in_colour.a > 0.75;
+    vec3 colour = own ? in_colour.rgb : thing_paint.rgb;
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    shines = (in_colour.a > 0.25 && !own) ? 1.0 : 0.0;
+    cover = layer < {_LAMP} ? float(layer) : -1.0;
+    albedo = shines > 0.5 ? colour : layer < {_LAMP} ? tint_of(colour, layer) : decoded(colour);
+    albedo *= own ? 1.0 : in_colour.r;
+    shines = layer == {_LAMP} ? -1.0 : shines;
+    spot = layer < {_LAMP} ? in_at / layers[layer].w : vec3(0.0);
     label = thing_paint.a * 255.0;
     gl_Position = project(at);
-}
+}}
 """
 
-_FRAGMENT: Final = """
-in vec3 at; in vec3 normal; in vec3 albedo; flat in float label; flat in float shines;
-void main() {
-    if (shines > 0.5) { glow(albedo, label); } else { show(albedo, normalize(normal), at, label); }
-}
+_FRAGMENT: Final = f"""
+in vec3 at; in vec3 normal; in vec3 albedo; in vec3 spot; in vec3 side;
+flat in float label; flat in float shines; flat in float cover;
+void main() {{
+    if (shines > 0.5) {{ glow(albedo, label); return; }}
+    vec3 colour = albedo, own = vec3(0.0), n = normalize(normal);
+    if (cover >= 0.0) {{
+        vec3 s = abs(side);
+        vec2 where = s.z > max(s.x, s.y) ? spot.xy : s.x > s.y ? spot.yz : spot.xz;
+        vec4 seen = texture(surfaces, vec3(where, cover));
+        colour *= decoded(seen.rgb);
+    }} else if (shines < -0.5) {{
+        own = vec3({_LAMPLIGHT}) * side_light.w;
+    }}
+    show_linear(colour, own, n, at, label);
+}}
 """
 
 
 class Coat(NamedTuple):
-    """A part of a form. colour: None is the instance's paint; glows: shines in it."""
+    """A part of a form. colour: None is the instance's paint; glows: shines in it. cover: the layer of the surfaces
+    that lies on it, "lamp" for what shines at night, "" for nothing; shade: (V,) light that reaches its corners."""
 
     mesh: Mesh
     colour: Colour | None = None
     glows: bool = False
+    cover: str = ""
+    shade: Floats | None = None
 
 
 class Forms:
     """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
 
-    def __init__(self, context: moderngl.Context, shadows: bool) -> None:
-        self._context = context
-        self.programs = programs(context, _VERTEX, _FRAGMENT, shadows)
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
+        self._context, self._layers = context, surfaces.surfaces
+        self.programs = programs(context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
+        for uniform in self.programs.uniforms("layers"):
+            if uniform is not None:
+                uniform.write(surfaces.known)
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._ids: dict[Hashable, int] = {}
@@ -79,12 +112,7 @@ class Forms:
         return self._ids[key]
 
     def _add(self, key: Hashable, parts: Sequence[Coat]) -> None:
-        rows, indices = joined(
-            [
-                (mesh, corners(mesh, colour or (0.0, 0.0, 0.0), _GLOW if glows else _OWN if colour else _PAINT))
-                for mesh, colour, glows in parts
-            ]
-        )
+        rows, indices = joined([(coat.mesh, self._rows(coat)) for coat in parts])
         first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
         self._corners.append(rows)
         self._indices.append(indices)
@@ -95,6 +123,14 @@ class Forms:
         self.rank[[self._ids[name] for name in by_name]] = np.arange(len(by_name))
         self.draws = np.array(self._starts, dtype=np.uint32)
         self.version += 1
+
+    def _rows(self, coat: Coat) -> Rows:
+        shade = np.ones(len(coat.mesh.vertices)) if coat.shade is None else coat.shade
+        colour = np.tile(coat.colour, (len(shade), 1)) if coat.colour else np.ones((len(shade), 3))
+        rows = corners(coat.mesh, colour * shade[:, None], _GLOW if coat.glows else _OWN if coat.colour else _PAINT)
+        named = {"": _BARE, "lamp": _LAMP}
+        rows["normal"][:, 3] = named[coat.cover] if coat.cover in named else self._layers.index(coat.cover)
+        return rows
 
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
         """Corners and triangles of all forms; arrays bound to those of an older `version` are void."""

@@ -17,7 +17,7 @@ from cosim.geometry import Floats
 from cosim.scenario import Barrier
 from cosim.state import LABELS, RobotState, Street, Vehicles
 from physics import props, vehicles
-from physics.furniture import KINDS, parts_of
+from physics.furniture import KINDS, Prop, parts_of
 from physics.gl.corners import Rows
 from physics.gl.crowd import Crowd
 from physics.gl.instances import INSTANCE, Coat, Forms, Things, instances
@@ -77,7 +77,7 @@ class Scene:
         self._surfaces = surfaces(context)
         self._shaders = tile_shaders(context, self._surfaces, shadows)
         self._wall_shaders = wall_shaders(context, self._surfaces, shadows, light.lamps > 0.0)
-        self._forms = Forms(context, shadows)
+        self._forms = Forms(context, self._surfaces, shadows)
         self._seen = Things(context, self._forms, ("colour",))
         self._standing = Things(context, self._forms, ("still",))
         self._movers = Things(context, self._forms, ("moving",))
@@ -137,10 +137,10 @@ class Scene:
     def draw(self, stage: Stage) -> None:
         """Draw what was arranged: the small and near first, then the ground from near to far."""
         self._crowd.draw(stage)
-        for things in (self._seen, self._standing, self._movers):
-            things.draw(stage)
         if stage == "colour":
             self._surfaces.bind()
+        for things in (self._seen, self._standing, self._movers):
+            things.draw(stage)
         if stage != "moving":
             for tile in self._in_view if stage == "colour" else self._shading:
                 tile.walls.draw(stage, self._anchor)
@@ -178,18 +178,22 @@ class Scene:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
         tile = self._ground.tile(key)
-        ground = TileBuffers(self._context, self._shaders, ground_parts(tile, self._ground.seed), middle)
+        ground = TileBuffers(
+            self._context, self._shaders, ground_parts(self._ground.street_map, tile, self._ground.seed), middle
+        )
         lines = paint_parts(self._ground.street_map, tile)
         painted = TileBuffers(self._context, self._shaders, lines, middle) if lines else None
-        walls = WallBuffers(self._context, self._wall_shaders, self._ground.buildings(key), middle)
+        walls = WallBuffers(
+            self._context, self._wall_shaders, self._ground.buildings(key), self._ground.street_map, middle
+        )
         posts = props.posts_in(self._ground.street_map, key)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._ground.heights(post_xy)
         furniture = self._ground.props(key)
-        form = [self._prop_form(prop.kind, prop.variant) for prop, _ in furniture]
+        form = [self._prop_form(prop) for prop, _ in furniture]
         xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
-        rows = instances(xyz, [prop.heading_rad for prop, _ in furniture], paint, LABELS["prop"])
+        rows = instances(xyz, [prop.drawn_rad for prop, _ in furniture], paint, LABELS["prop"])
         pole = self._forms.id(("signal", "post"), lambda: [Coat(props.post_mesh(), props.POLE)])
         headings = [post.heading_rad for post in posts]
         poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
@@ -198,9 +202,10 @@ class Scene:
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
         return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
 
-    def _prop_form(self, kind: str, variant: int) -> int:
+    def _prop_form(self, prop: Prop) -> int:
         return self._forms.id(
-            ("prop", kind, variant), lambda: [Coat(part.mesh, part.colour) for part in parts_of(kind, variant)]
+            ("prop", *prop.form),
+            lambda: [Coat(part.mesh, part.colour, False, part.cover, part.shade) for part in parts_of(*prop.form)],
         )
 
     def _things(self, view: View) -> Placed:

@@ -1,4 +1,4 @@
-"""The textures of ground, walls and facades on the graphics card, shared by all cameras of a process."""
+"""The textures of ground, walls, things and facades on the graphics card, shared by all cameras of a process."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Stage, 
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined
-from physics.textures.walls import wall_layers
+from physics.textures.walls import prop_layers, wall_layers
 
 SIZE_PX: Final = 256
-LAYERS_MAX: Final = 64
+LAYERS_MAX: Final = 72
 
 LOOKED_UP: Final = f"""
 layout(binding = {SURFACES_UNIT}) uniform sampler2DArray surfaces;
@@ -34,7 +34,8 @@ vec3 tint_of(vec3 colour, int layer) {{ return decoded(colour) / layers[layer].r
 
 @dataclass(frozen=True, slots=True)
 class Surfaces:
-    """surfaces: layers of ground and walls; facades: bays of facades; known: the uniform `layers`, (LAYERS_MAX, 4)."""
+    """surfaces: layers of ground, walls and things; facades: bays of facades; known: the uniform `layers`,
+    (LAYERS_MAX, 4)."""
 
     surfaces: Layers
     facades: Layers
@@ -75,7 +76,7 @@ class SurfaceShaders:
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
     """Made once in a context; they stay as long as it."""
-    flat, facades = joined(ground_layers(SIZE_PX), wall_layers(SIZE_PX)), facade_layers(SIZE_PX)
+    flat, facades = joined(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX)), facade_layers(SIZE_PX)
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]
     assert facades.finish is not None

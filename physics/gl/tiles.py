@@ -10,6 +10,7 @@ import moderngl
 from cosim.geometry import Floats
 from cosim.state import LABELS
 from cosim.streetmap import StreetMap
+from physics.frontage import frontage_in
 from physics.gl.corners import LAYOUT, corners, joined
 from physics.gl.shading import Stage
 from physics.gl.surfaces import Surfaces, SurfaceShaders
@@ -64,9 +65,11 @@ class GroundPart(NamedTuple):
     tint: tuple[float, float, float] | None = None
 
 
-def ground_parts(tile: Tile, seed: int) -> list[GroundPart]:
-    """The ground of a tile, a part for each of its surfaces."""
-    found = []
+def ground_parts(street_map: StreetMap, tile: Tile, seed: int) -> list[GroundPart]:
+    """The ground of a tile, a part for each of its surfaces; what lies over another is drawn first."""
+    found = [
+        GroundPart(mesh, cover.layer, "ground", cover.colour) for mesh, cover in frontage_in(street_map, tile, seed)
+    ]
     for name, mesh in tile.parts.items():
         label, colour = surface(name)
         found.append(GroundPart(mesh, layer_of(name, seed), label, colour if name in PAVINGS else None))

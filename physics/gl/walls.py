@@ -1,7 +1,8 @@
 """Buildings of a tile as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
 
 What is drawn has the shape that physics.buildings gives it; which wall, which windows and which fronts a building has
-hangs on its name. Each bay of each storey draws its own variant.
+hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all along, and
+doors at even distances.
 """
 
 from __future__ import annotations
@@ -16,12 +17,14 @@ from numpy.typing import NDArray
 
 from cosim.geometry import Floats
 from cosim.state import LABELS
+from cosim.streetmap import StreetMap
 from physics.buildings import Building, facade_meshes
 from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
 from physics.gl.surfaces import Surfaces, SurfaceShaders
 from physics.mesh import Mesh
+from physics.placement import street_style
 from physics.textures.facade_canvas import BAY_M, STOREY_M
-from physics.textures.facades import VARIANTS, WALL_STYLES
+from physics.textures.facades import DOORS, STREETS, VARIANTS, WALL_STYLES, WallStyle
 from physics.tiles import CURB_M
 
 _CORNER: Final = np.dtype(
@@ -32,7 +35,7 @@ _CORNER: Final = np.dtype(
 )  # fmt: skip
 """normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres, in bays and storeys;
 kind: first layer of the upper storeys' windows, storeys, whether it looks to the street, chance;
-fronts: layers of three fronts, chance."""
+fronts: layers of the front and of its bays with doors, 16 times the bays from door to door and the first, chance."""
 _LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "in_spot", "in_kind", "in_fronts")
 _LIT_SHARE: Final = 0.35
 _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
@@ -73,9 +76,9 @@ void main() {{
     vec3 albedo = decoded(wall.rgb) * mix(vec3(1.0), tint.rgb, wall.a);
     vec2 cell = floor(cells);
     float drawn = chance(cell, kind.w + 7.0 * fronts.w);
-    float which = drawn * 3.0;
     bool ground_floor = cell.y < 0.5 && kind.z > 0.5;
-    float front = which < 1.0 ? fronts.x : which < 2.0 ? fronts.y : fronts.z;
+    float every = floor(fronts.z / 16.0);
+    float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
     float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {VARIANTS}.0);
     vec4 bay = texture(facades, vec3(cells.x, -cells.y, layer));
     bool none = cell.y < 0.0 || cell.y >= kind.y;
@@ -99,10 +102,15 @@ class WallBuffers:
     """The buildings of one tile. middle: (2,) world metres of the tile's."""
 
     def __init__(
-        self, context: moderngl.Context, shaders: SurfaceShaders, buildings: Sequence[Building], middle: Floats
+        self,
+        context: moderngl.Context,
+        shaders: SurfaceShaders,
+        buildings: Sequence[Building],
+        street_map: StreetMap,
+        middle: Floats,
     ) -> None:
         self._shaders, self._middle = shaders, middle
-        parts = [rows for building in buildings for rows in _rows(building, shaders.surfaces, middle)]
+        parts = [rows for b in buildings for rows in _rows(b, style_of(b, street_map), shaders.surfaces, middle)]
         self._arrays: list[moderngl.VertexArray] = []
         self._buffers: list[moderngl.Buffer] = []
         if not parts:
@@ -128,16 +136,26 @@ class WallBuffers:
             buffer.release()
 
 
-def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
+def style_of(building: Building, street_map: StreetMap) -> WallStyle:
+    """What a building looks like: drawn by its name from those that its street has."""
+    strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
+    names = STREETS.get(street_style(strip.street_class) if strip is not None else "", STREETS[""])
+    return WALL_STYLES[names[zlib.crc32(f"style:{building.id}".encode()) % len(names)]]
+
+
+def _rows(
+    building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
+) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
     """Corners and triangles of a building's walls and roof."""
     rng = np.random.default_rng(zlib.crc32(building.id.encode()))
-    style = list(WALL_STYLES.values())[int(rng.integers(len(WALL_STYLES)))]
     layers, bays = surfaces.surfaces, surfaces.facades
     wall = layers.index(str(rng.choice(style.walls)))
     roof = layers.index(str(rng.choice(style.roofs)))
     upper = bays.index(f"{rng.choice(style.uppers)}-0")
     number = int(rng.integers(VARIANTS))
-    fronts = [bays.index(f"{name}-{number}") for name in rng.choice(style.fronts, 3)]
+    front = DOORS[str(rng.choice(style.fronts))]
+    fronts = [bays.index(f"{name}-{number}") for name in (front.between, front.door)]
+    doors = 16 * front.every + int(rng.integers(front.every))
     colour = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
     chance = rng.integers(0, 256, 2)
     street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
@@ -157,7 +175,7 @@ def _rows(building: Building, surfaces: Surfaces, middle: Floats) -> list[tuple[
         rows["kind"] = np.stack(
             [np.full(len(rows), upper), storeys, mesh.normals @ street > 0.9, np.full(len(rows), chance[0])], 1
         )
-        rows["fronts"] = *fronts, chance[1]
+        rows["fronts"] = *fronts, doors, chance[1]
         found.append((rows, mesh.triangles))
     return found
 

@@ -21,10 +21,14 @@ Area = tuple[slice, slice]
 
 
 class Canvas:
-    """rgb: (S, S, 3) linear, premultiplied; wall: (S, S) how much of the wall shows; gloss, glow: (S, S)."""
+    """rgb: (S, S, 3) linear, premultiplied; wall: (S, S) how much of the wall shows; gloss, glow: (S, S).
 
-    def __init__(self, noise: Noise) -> None:
+    number: of the variant; what the bays of one front have in common, such as its colour, goes by it.
+    """
+
+    def __init__(self, noise: Noise, number: int = 0) -> None:
         size = noise.size
+        self.number = number
         self.noise, self.rng, self.size = noise, noise.rng, size
         self.rgb = np.zeros((size, size, 3), np.float32)
         self.wall = np.ones((size, size), np.float32)

@@ -22,16 +22,16 @@ def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
     """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12 mm each."""
     styles = {**WINDOWS, **FRONTS}
     recipes = {
-        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style))
+        f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style, k))
         for name, style in styles.items()
         for k in range(VARIANTS)
     }
     return stacked(recipes, size_px, seed)
 
 
-def _drawn(style: Callable[[Canvas], None]) -> Callable[[Noise], Picture]:
+def _drawn(style: Callable[[Canvas], None], number: int) -> Callable[[Noise], Picture]:
     def make(noise: Noise) -> Picture:
-        canvas = Canvas(noise)
+        canvas = Canvas(noise, number)
         style(canvas)
         return canvas.picture()
 
@@ -42,7 +42,7 @@ def _drawn(style: Callable[[Canvas], None]) -> Callable[[Noise], Picture]:
 class WallStyle:
     """What a kind of building shows. walls, roofs: names of wall layers; uppers, fronts: styles of bays, with a
     number behind them in the layers. A building takes one wall, one roof, one upper style whose number changes from
-    bay to bay, and a few fronts of one number, so that its shops match. tints: sRGB colours of the wall, of which it
+    bay to bay, and one front (see DOORS) of one number. tints: sRGB colours of the wall, of which it
     takes one; empty: the wall's own colour."""
 
     walls: tuple[str, ...]
@@ -51,6 +51,27 @@ class WallStyle:
     roofs: tuple[str, ...]
     tints: tuple[tuple[float, float, float], ...] = ()
 
+
+@dataclass(frozen=True, slots=True)
+class Front:
+    """A ground floor: the bays between its doors, a bay with a door, and one door every so many bays (at most 15)."""
+
+    between: str
+    door: str
+    every: int
+
+
+DOORS: Final[Mapping[str, Front]] = {
+    "shop": Front("shop-window", "shop", 3),
+    "shop-awning": Front("shop-awning", "shop", 4),
+    "cafe": Front("cafe", "cafe-door", 4),
+    "entrance": Front("home", "entrance", 4),
+    "home": Front("home", "entrance", 6),
+    "garage": Front("garage", "blank", 4),
+    "lobby": Front("lobby", "lobby", 1),
+    "blank": Front("blank", "entrance", 7),
+}
+"""What the fronts of WallStyle are."""
 
 _SHOPS: Final = ("shop", "shop-awning", "cafe", "shop", "entrance")
 _HOMES: Final = ("entrance", "home", "home", "blank", "garage")
@@ -129,3 +150,15 @@ WALL_STYLES: Final[Mapping[str, WallStyle]] = {
     ),
 }
 """Kinds of buildings."""
+
+_OLD: Final = ("plaster-old", "brick-old", "brick-painted", "stone")
+STREETS: Final[Mapping[str, tuple[str, ...]]] = {
+    "commercial": (*_OLD, *_OLD, "plaster-old", "brick-painted", "office"),
+    "narrow": (*_OLD, *_OLD, "plaster-old", "plaster-old", "wood"),
+    "avenue": (*_OLD, "plaster-old", "office", "office", "plaster-new", "slab"),
+    "boulevard": (*_OLD, "stone", "plaster-old", "office", "plaster-new"),
+    "ring": ("office", "office", "slab", "shed", "plaster-new", "brick-new"),
+    "residential": ("plaster-new", "plaster-new", "brick-new", "brick-new", "wood", "slab", "plaster-old", "brick-old"),
+    "": ("plaster-old", "plaster-old", "plaster-new", "plaster-new", "brick-old", "brick-new", "stone", "slab"),
+}
+"""Which of WALL_STYLES stand in a class of streets, as often as they are named; "": wherever that is not known."""

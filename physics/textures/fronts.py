@@ -87,10 +87,9 @@ def _fascia(canvas: Canvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -
             x += wide + canvas.rng.choice([0.035, 0.035, 0.12])
 
 
-def _shop(canvas: Canvas) -> None:
-    colour = _pick(canvas, _FASCIAS)
+def _shop(canvas: Canvas, door: bool = True) -> None:
+    colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
-    door = canvas.rng.random() < 0.6
     right = 1.85 if door else BAY_M - 0.1
     canvas.box(0.1, right, 0.08, 0.45, _scaled(colour, 1.12))
     canvas.shade(0.1, right, 0.42, 0.45, 0.4)
@@ -122,22 +121,35 @@ def _awning(canvas: Canvas, z0: float, z1: float) -> None:
     canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
 
 
+def _shop_window(canvas: Canvas) -> None:
+    _shop(canvas, door=False)
+
+
 def _shop_awning(canvas: Canvas) -> None:
-    _shop(canvas)
+    _shop(canvas, door=False)
     _awning(canvas, 1.98, 2.56)
 
 
-def _cafe(canvas: Canvas) -> None:
-    frame = _pick(canvas, _DOORS)
+def _cafe(canvas: Canvas, door: bool = False) -> None:
+    frame = _FASCIAS[(2 * canvas.number + 1) % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 2.9, frame)
     for k in range(3):
         x0 = 0.08 + 0.96 * k
+        if door and k == 1:
+            canvas.box(x0, x0 + 0.88, 0.0, 2.15, _scaled(frame, 0.6))
+            canvas.frame(x0 + 0.04, x0 + 0.84, 0.02, 2.13, 0.09, _scaled(frame, 1.2))
+            pane(canvas, x0 + 0.13, x0 + 0.75, 0.35, 2.04, dress=False)
+            continue
         canvas.box(x0, x0 + 0.88, 0.06, 0.55, _scaled(frame, 1.25))
         canvas.shade(x0 + 0.08, x0 + 0.80, 0.14, 0.47, 0.25)
         _display(canvas, x0, x0 + 0.88, 0.62, 2.15)
         pane(canvas, x0, x0 + 0.88, 2.22, 2.6, dress=False)
     canvas.shade(0.0, BAY_M, 2.45, 2.6, 0.4, 0.15)
     _fascia(canvas, _scaled(frame, 0.85), 2.62, 3.0)
+
+
+def _cafe_door(canvas: Canvas) -> None:
+    _cafe(canvas, door=True)
 
 
 def _entrance(canvas: Canvas) -> None:
@@ -212,8 +224,10 @@ def _blank(canvas: Canvas) -> None:
 
 FRONTS: Final[Mapping[str, Callable[[Canvas], None]]] = {
     "shop": _shop,
+    "shop-window": _shop_window,
     "shop-awning": _shop_awning,
     "cafe": _cafe,
+    "cafe-door": _cafe_door,
     "entrance": _entrance,
     "home": _home,
     "garage": _garage,
