@@ -89,15 +89,15 @@ class People:
 
     def only(self, rows: NDArray[np.intp]) -> People:
         """Those in these rows."""
-        return People.of(
-            tuple(self.ids[i] for i in rows.tolist()),
-            self.xy[rows],
-            self.heading[rows],
-            self.speed[rows],
-            tuple(self.doing[i] for i in rows.tolist()),
-            self.strides[rows],
-            self.pace[rows],
-        )
+        if len(rows) == len(self.ids) and (rows == np.arange(len(rows))).all():
+            return self
+        arrays = [array[rows] for array in (self.xy, self.heading, self.speed, self.strides, self.pace)]
+        for array in arrays:
+            array.flags.writeable = False
+        xy, heading, speed, strides, pace = arrays
+        chosen = rows.tolist()
+        ids, doing = tuple([self.ids[i] for i in chosen]), tuple([self.doing[i] for i in chosen])
+        return People(ids, xy, heading, speed, doing, strides, pace)
 
     def __len__(self) -> int:
         return len(self.ids)

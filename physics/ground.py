@@ -19,7 +19,7 @@ from physics.mapped import MappedThings
 from physics.materials import Paving
 from physics.placement import Placement
 from physics.robots import RobotModel
-from physics.tiles import Key, Tile, build_tile, key_at, square
+from physics.tiles import Key, Tile, build_tile, cells_of, key_at, square
 
 _KEPT: Final = 100
 _WHEELS: Final = np.array([0.32, 0.4])
@@ -43,6 +43,7 @@ class Ground:
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage, mapped)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
+        self._leant: tuple[Pose, RobotModel, tuple[float, float, float]] | None = None
 
     def tile(self, key: Key) -> Tile:
         if key not in self._tiles:
@@ -122,15 +123,23 @@ class Ground:
     def heights(self, xy: ArrayLike) -> Floats:
         """Height of the ground at (N, 2) points, (N,) metres."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
+        cells = cells_of(xy)
+        if len(xy) and (cells == cells[0]).all():
+            return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
         height = np.zeros(len(xy))
-        keys = [key_at(x, y) for x, y in xy]
-        for key in dict.fromkeys(keys):
-            here = np.array([k == key for k in keys])
-            height[here] = self.tile(key).height(xy[here])
+        for i, j in dict.fromkeys(map(tuple, cells.tolist())):
+            here = (cells[:, 0] == i) & (cells[:, 1] == j)
+            height[here] = self.tile((i, j)).height(xy[here])
         return height
 
     def lean(self, pose: Pose, model: RobotModel) -> tuple[float, float, float]:
-        """How a robot stands at a pose: height of the base frame in metres, roll and pitch in radians."""
+        """How a robot stands at a pose: height of the base frame in metres, roll and pitch in radians. Who asks for the
+        same pose again gets the last answer."""
+        if self._leant is None or self._leant[0] != pose or self._leant[1] is not model:
+            self._leant = pose, model, self._lean(pose, model)
+        return self._leant[2]
+
+    def _lean(self, pose: Pose, model: RobotModel) -> tuple[float, float, float]:
         cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
         ahead, aside = 0.5 * model.wheelbase_m, 0.5 * model.track_m
         feet = [(a * ahead, b * aside) for a in (1, -1) for b in (1, -1)]

@@ -97,6 +97,11 @@ def key_at(x_m: float, y_m: float) -> Key:
     return math.floor((x_m - _ORIGIN_M) / TILE_M), math.floor((y_m - _ORIGIN_M) / TILE_M)
 
 
+def cells_of(xy: Floats) -> NDArray[np.int64]:
+    """(N, 2) the tiles that hold (N, 2) points, as `key_at` says."""
+    return np.asarray(np.floor((xy - _ORIGIN_M) / TILE_M), dtype=np.int64)
+
+
 def square(key: Key) -> tuple[float, float, float, float]:
     """x0, y0, x1, y1 of a tile in metres."""
     x, y = key[0] * TILE_M + _ORIGIN_M, key[1] * TILE_M + _ORIGIN_M

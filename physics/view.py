@@ -39,11 +39,16 @@ class View:
 
     def rows(self, xy: Floats, margin_m: float) -> NDArray[np.intp]:
         """Which of (N, 2) points can be in the picture, things of radius `margin_m` standing on them."""
+        return self.sees(xy, margin_m).nonzero()[0]
+
+    def sees(self, xy: Floats, margin_m: float, reach_m: float = VISIBLE_M) -> NDArray[np.bool_]:
+        """Whether each of (N, 2) points can be in a picture that reaches so far."""
         offset = xy - self.eye_m[:2]
         cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
         ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
         wide = aside * math.cos(self.half_angle_rad) - ahead * math.sin(self.half_angle_rad)
-        return np.flatnonzero((wide < margin_m) & (ahead > -margin_m) & (np.hypot(ahead, aside) < VISIBLE_M))
+        seen = (wide < margin_m) & (ahead > -margin_m)
+        return np.asarray(seen if math.isinf(reach_m) else seen & (np.hypot(ahead, aside) < reach_m))
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,12 @@ class Shot:
         """How far the view points below the horizon."""
         ahead = self.target_m - self.eye_m
         return math.atan2(-ahead[2], math.hypot(ahead[0], ahead[1]))
+
+    @property
+    def half_picture(self) -> tuple[float, float]:
+        """Tangents of the angles from the middle to the right and to the upper edge."""
+        tall = math.tan(math.radians(0.5 * self.fov_deg))
+        return tall * self.size[0] / self.size[1], tall
 
     @cached_property
     def view(self) -> View:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.errors import EngineError
+from cosim.geometry import Floats
 from cosim.ports import CameraSpec
 from cosim.scenario import Light
 from cosim.state import Frame, RobotState, Street
@@ -45,6 +46,8 @@ class GlCamera:
         self._light = lighting_of(self._sky)
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
+        self._from_sun: Floats | None = None
+        self._to_map: Floats = _TO_TEXTURE
 
     def __enter__(self) -> Self:
         if self._context is None:
@@ -52,7 +55,7 @@ class GlCamera:
             with context() as gl:
                 self._scene = Scene(gl, world.ground, world.barriers, world.model, self._light)
                 self._shadows = ShadowMaps(gl) if shadows else None
-                self._block = SceneBlock(gl)
+                self._block, self._sun_block = SceneBlock(gl), SceneBlock(gl)
                 self._backdrop = Backdrop(gl, self._sky)
             self._context = gl
         return self
@@ -70,10 +73,11 @@ class GlCamera:
                 if self._shadows is not None:
                     self._shadows.release()
                 self._block.release()
+                self._sun_block.release()
                 self._backdrop.release()
                 while self._targets:
                     self._targets.popitem()[1].release()
-            self._context = None
+            self._context = self._from_sun = None
 
     def render(self, robot: RobotState, street: Street) -> Frame:
         """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
@@ -119,14 +123,17 @@ class GlCamera:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
         anchor = anchor_of(taken.eye_m)
         self._scene.arrange(taken, anchor, street, robot, body)
-        from_sun = np.eye(4)
         if self._shadows is not None:
             middle = middle_of(taken.eye_m)
             from_sun = self._shadows.matrix(middle, anchor, self._light)
-            self._block.write(from_sun, from_sun, taken, anchor, self._light)
+            if from_sun is self._from_sun:
+                self._sun_block.bind()
+            else:
+                self._sun_block.write(from_sun, from_sun, taken, anchor, self._light)
+                self._from_sun, self._to_map = from_sun, _TO_TEXTURE @ from_sun
             self._shadows.draw(middle, anchor, self._light, self._scene.draw)
             self._shadows.bind()
-        self._block.write(camera_matrix(taken, anchor), _TO_TEXTURE @ from_sun, taken, anchor, self._light)
+        self._block.write(camera_matrix(taken, anchor), self._to_map, taken, anchor, self._light)
         target.use()
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         gl.front_face = "cw"  # the picture is drawn upside down, to be read top first

@@ -8,6 +8,7 @@ for those near (four joints per vertex) and one for those far away (two).
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final
 
 import moderngl
@@ -28,6 +29,7 @@ from physics.view import Shot
 LEVEL_PX: Final = (170.0, 60.0, 22.0)
 """Drawn height of a body, in pixels, below which the next coarser level is taken."""
 
+_INSTANCE: Final = np.dtype([("person", "i4"), ("girth", "f4")])
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
 
@@ -80,8 +82,11 @@ class Crowd:
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level), shadows)
         self._worn = worn is not None
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
+        self._starts = np.zeros((LEVELS * len(ALL), 3), dtype=np.uint32)
+        self._known = np.zeros(len(self._starts), dtype=bool)
         self._split = (0, 0, 0)
         self._room = 0
+        self._dyed_for: tuple[str, ...] = ()
         self._grow(_CROWD_MIN)
 
     def set(
@@ -109,12 +114,12 @@ class Crowd:
         told[:, 0], told[:, 1] = posed.rows, posed.weights
         told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = people.xy - anchor, z_m, posed.scale
         told[:, 3, 0], told[:, 3, 1] = np.cos(people.heading), np.sin(people.heading)
-        looks = [look(name) for name in people.ids]
-        self._told.write(told.tobytes(), viewport=(0, 0, 4, count))
-        self._dyed.write(np.stack([who.colours for who in looks]).tobytes(), viewport=(0, 0, len(COATS), count))
-        level = np.where(seen, levels(people.xy, z_m, shot), -1)
-        girth = np.array([who.girth_m for who in looks], dtype=np.float32)
-        self._set_draws(np.array([who.outfit for who in looks]), level, casts, girth)
+        outfit, girth, colours = _dressed(people.ids)
+        self._told.write(told, viewport=(0, 0, 4, count))
+        if people.ids != self._dyed_for:
+            self._dyed.write(colours, viewport=(0, 0, len(COATS), count))
+            self._dyed_for = people.ids
+        self._set_draws(outfit, levels(people.xy, z_m, shot), seen, casts, girth)
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, count)
         self._context.enable_only(moderngl.NOTHING)
@@ -144,44 +149,55 @@ class Crowd:
             thing.release()
 
     def _set_draws(
-        self, outfit: NDArray[np.intp], level: NDArray[np.intp], casts: NDArray[np.bool_], girth: NDArray[np.float32]
+        self,
+        outfit: NDArray[np.intp],
+        level: NDArray[np.intp],
+        seen: NDArray[np.bool_],
+        casts: NDArray[np.bool_],
+        girth: NDArray[np.float32],
     ) -> None:
-        """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows. A level of -1 is
-        not in the picture."""
-        coarsest = np.full(len(outfit), LEVELS - 1)
+        """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows, which have a
+        level of their own behind the last."""
+        cast = np.full(len(outfit), LEVELS)
         if self._worn:
-            level, coarsest, outfit = np.minimum(level, 0), np.zeros_like(level), np.zeros_like(outfit)
-        rows, commands, split = [], [], []
-        at = 0
-        near = (level >= 0) & (level < MESH_LEVELS)
-        for kind, chosen in ((level, near), (level, level >= MESH_LEVELS), (coarsest, casts)):
-            who = np.flatnonzero(chosen)
-            key = kind[who] * len(ALL) + outfit[who]
-            order = np.argsort(key, kind="stable")
-            who, key = who[order], key[order]
-            first = np.flatnonzero(np.diff(key, prepend=-1))
-            lengths = np.diff(first, append=len(who))
-            for k, many in zip(first.tolist(), lengths.tolist(), strict=True):
-                form, detail = int(outfit[who[k]]), int(kind[who[k]])
-                skins = self._near if detail < MESH_LEVELS else self._far
-                indices, index, vertex = skins.start(form, detail)
-                commands.append((indices, many, index, vertex, at + k))
-            rows.append(who)
-            split.append(len(first))
-            at += len(who)
-        self._split = (split[0], split[1], split[2])
-        if not commands:
+            level, outfit = np.zeros_like(level), np.zeros_like(outfit)
+        in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
+        people = np.concatenate([in_view, casting])
+        if not len(people):
             return
-        people = np.concatenate(rows)
-        table = np.zeros(len(people), dtype=[("person", "i4"), ("girth", "f4")])
+        key = np.concatenate([level[in_view], cast[casting]]) * len(ALL) + outfit[people]
+        order = key.argsort(kind="stable")
+        people, key = people[order], key[order]
+        begins = np.empty(len(key), dtype=bool)
+        begins[0], begins[1:] = True, key[1:] != key[:-1]
+        first = begins.nonzero()[0]
+        form = key[first]
+        start = self._start(form)
+        commands = np.empty((len(first), 5), dtype=np.uint32)
+        commands[:, 0], commands[:, 2:4], commands[:, 4] = start[:, 0], start[:, 1:], first
+        commands[:-1, 1] = first[1:] - first[:-1]
+        commands[-1, 1] = len(key) - first[-1]
+        near, far = form.searchsorted((MESH_LEVELS * len(ALL), LEVELS * len(ALL))).tolist()
+        self._split = near, far - near, len(form) - far
+        table = np.empty(len(people), dtype=_INSTANCE)
         table["person"], table["girth"] = people, girth[people]
-        self._instances.write(table.tobytes())
-        self._commands.write(np.array(commands, dtype=np.uint32).tobytes())
+        self._instances.write(table)
+        self._commands.write(commands)
+
+    def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
+        """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the coarsest level."""
+        form = np.where(form < LEVELS * len(ALL), form, 0 if self._worn else form - len(ALL))
+        if not self._known[form].all():
+            for one in dict.fromkeys(form[~self._known[form]].tolist()):
+                level, outfit = divmod(one, len(ALL))
+                self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(outfit, level)
+                self._known[one] = True
+        return self._starts[form]
 
     def _grow(self, room: int) -> None:
         """Make room for more people."""
         self._release_room()
-        self._room = room
+        self._room, self._dyed_for = room, ()
         self._told = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
@@ -196,6 +212,14 @@ class Crowd:
         for thing in self._held:
             thing.release()
         self._held = []
+
+
+@lru_cache(maxsize=64)
+def _dressed(ids: tuple[str, ...]) -> tuple[NDArray[np.intp], NDArray[np.float32], bytes]:
+    """(N,) outfits and girths of people, and their colours as they go up."""
+    looks = [look(name) for name in ids]
+    girth = np.array([who.girth_m for who in looks], dtype=np.float32)
+    return np.array([who.outfit for who in looks]), girth, np.stack([who.colours for who in looks]).tobytes()
 
 
 def levels(xy: Floats, z_m: Floats, shot: Shot) -> NDArray[np.intp]:

@@ -161,21 +161,22 @@ class Things:
 
     def set(self, form: NDArray[np.int64], rows: NDArray[np.void]) -> None:
         """(N,) numbers of forms and (N,) rows of INSTANCE."""
-        order = np.argsort(self._forms.rank[form], kind="stable")
-        form = form[order]
-        first = np.flatnonzero(np.diff(form, prepend=-1))
-        self._count = len(first)
-        if self._count == 0:
+        self._count = 0
+        if not len(form):
             return
+        order = self._forms.rank[form].argsort(kind="stable")
+        form = form[order]
+        first = np.concatenate([[0], (form[1:] != form[:-1]).nonzero()[0] + 1])
+        self._count = len(first)
         commands = np.empty((len(first), 5), dtype=np.uint32)
         draws = self._forms.draws[form[first]]
         commands[:, 0], commands[:, 2:4], commands[:, 4] = draws[:, 0], draws[:, 1:], first
-        commands[:, 1] = np.diff(first, append=len(form))
+        commands[:-1, 1], commands[-1, 1] = first[1:] - first[:-1], len(form) - first[-1]
         if len(form) > self._room:
             self._make_room(2 * len(form))
         assert self._instances is not None and self._commands is not None
-        self._instances.write(rows[order].tobytes())
-        self._commands.write(commands.tobytes())
+        self._instances.write(rows[order])
+        self._commands.write(commands)
 
     def draw(self, stage: Stage) -> None:
         if self._count and stage in self._stages:

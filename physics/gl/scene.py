@@ -40,6 +40,7 @@ _TILE_REACH_M: Final = 34.0
 
 Placed = tuple[NDArray[np.int64], Rows]
 """Numbers of forms and rows of instances."""
+_CLOCK: Final = Clock()
 _NOTHING: Final[Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTANCE))
 
 
@@ -84,48 +85,50 @@ class Scene:
         self._still_for: tuple[float, ...] | None = None
         self._shading: list[_Tile] = []
         self._keys: list[Key] = []
-        self._stands_for: tuple[object, ...] | None = None
+        self._anchor: Floats = np.zeros(2)
+        self._stands_for: tuple[frozenset[Key], Floats] | None = None
         self._stands: Placed = _NOTHING
         self._stands_xy: Floats = np.zeros((0, 2))
         self._stands_seen_m: Floats = np.zeros(0)
+        self._posts: list[tuple[props.SignalPost, float]] = []
+        self._lit_for: list[bool | None] = []
+        self._lit: Placed = _NOTHING
         self._around: list[_Tile] = []
+        self._middles: Floats = np.zeros((0, 2))
         self._in_view: list[_Tile] = []
-        self._anchor: Floats = np.zeros(2)
         self._fences = [self._fence(barrier) for barrier in barriers]
         self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
+        self._fleet: dict[tuple[str, float, float], tuple[int, vehicles.Colour]] = {}
         self._crowd = Crowd(context, shadows)
 
     def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None, body: bool) -> None:
         """Hold everything that a picture can show. body: the robot itself is in the picture, not its shadow alone."""
-        view, self._anchor = shot.view, anchor
+        view = shot.view
+        if (anchor != self._anchor).any():
+            self._anchor = anchor
         self._stream(view)
         self._show_people(shot, street)
-        placed = [
-            self._things(view),
-            *self._fences_now(),
-            self._lamps(street),
-            self._vehicles(view.rows(street.vehicles.xy, VEHICLE_MARGIN_M), street.vehicles),
-        ]
-        myself = self._robot(robot) if robot is not None else _NOTHING
+        middle = middle_of(view.eye_m)
+        seen, cast = self._vehicles(view, middle, street.vehicles)
+        placed = [self._things(view), *self._fences_now(), self._lamps(street), seen]
+        myself = self._robot(robot) if robot is not None and (body or self._shadows) else _NOTHING
         _set(self._seen, [*placed, myself] if body else placed)
         if self._shadows:
-            self._cast(middle_of(view.eye_m), street, myself)
+            _set(self._movers, [cast, myself])
+            self._stand(middle)
 
     def _show_people(self, shot: Shot, street: Street) -> None:
         """Those who can be in the picture, and those whose shadows can."""
         xy = street.people.xy
-        seen = np.zeros(len(xy), dtype=bool)
-        seen[shot.view.rows(xy, PERSON_MARGIN_M)] = True
-        casts = np.hypot(*(xy - shot.eye_m[:2]).T) < CAST_M
-        rows = np.flatnonzero(seen | casts if self._shadows else seen)
+        seen = shot.view.sees(xy, PERSON_MARGIN_M)
+        casts = _near(xy, shot.eye_m, CAST_M)
+        rows = (seen | casts if self._shadows else seen).nonzero()[0]
         who = street.people.only(rows)
         z = self._ground.heights(who.xy)
-        self._crowd.set(who, Clock().time_s(street.tick), z, shot, self._anchor, seen[rows], casts[rows])
+        self._crowd.set(who, _CLOCK.time_s(street.tick), z, shot, self._anchor, seen[rows], casts[rows])
 
-    def _cast(self, middle: Floats, street: Street, robot: Placed) -> None:
-        """What throws shadows in the square around its middle, seen or not."""
-        cars = np.flatnonzero(np.hypot(*(street.vehicles.xy - middle[:2]).T) < REACH_M)
-        _set(self._movers, [self._vehicles(cars, street.vehicles), robot])
+    def _stand(self, middle: Floats) -> None:
+        """What stands and throws shadows in the square around its middle, seen or not."""
         still = (*middle.tolist(), *self._anchor.tolist())
         if still != self._still_for:
             keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
@@ -163,16 +166,16 @@ class Scene:
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
-        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
-            self._tiles.pop(key).release()
-        keys = sorted(keys_within(x, y, VISIBLE_M), key=lambda key: (distance_to(key, x, y), key))
-        for key in keys:
-            if key not in self._tiles:
-                self._tiles[key] = self._built(key)
-        self._keys = keys
-        self._around = [self._tiles[key] for key in keys]
-        middles = np.array([tile.middle for tile in self._around])
-        self._in_view = [self._around[i] for i in _in_wedge(view, middles, _TILE_REACH_M)]
+        keys = [key for _, key in sorted((distance_to(key, x, y), key) for key in keys_within(x, y, VISIBLE_M))]
+        if keys != self._keys:
+            for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
+                self._tiles.pop(key).release()
+            for key in keys:
+                if key not in self._tiles:
+                    self._tiles[key] = self._built(key)
+            self._keys, self._around = keys, [self._tiles[key] for key in keys]
+            self._middles = np.array([tile.middle for tile in self._around])
+        self._in_view = [self._around[i] for i in view.sees(self._middles, _TILE_REACH_M, math.inf).nonzero()[0]]
 
     def _built(self, key: Key) -> _Tile:
         x0, y0, x1, y1 = square(key)
@@ -210,17 +213,17 @@ class Scene:
 
     def _things(self, view: View) -> Placed:
         """What stands in the tiles around, as far as it is drawn."""
-        around = (*sorted(self._keys), *self._anchor.tolist())
-        if around != self._stands_for:
-            tiles = [self._tiles[key] for key in sorted(self._keys)]
+        keys = frozenset(self._keys)
+        if self._stands_for is None or self._stands_for[0] != keys or self._stands_for[1] is not self._anchor:
+            tiles = [self._tiles[key] for key in sorted(keys)]
             placed = [self._shifted(tile, np.arange(len(tile.thing_xy))) for tile in tiles]
             self._stands = np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed])
             self._stands_xy = np.concatenate([tile.thing_xy for tile in tiles])
             self._stands_seen_m = np.concatenate([tile.seen_m for tile in tiles])
-            self._stands_for = around
+            self._posts = [one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)]
+            self._stands_for, self._lit_for = (keys, self._anchor), []
         rows = view.rows(self._stands_xy, PROP_MARGIN_M)
-        gap = np.hypot(*(self._stands_xy[rows] - view.eye_m[:2]).T)
-        rows = rows[gap < self._stands_seen_m[rows]]
+        rows = rows[_near(self._stands_xy[rows], view.eye_m, self._stands_seen_m[rows])]
         form, things = self._stands
         return form[rows], things[rows]
 
@@ -247,35 +250,51 @@ class Scene:
         return placed
 
     def _lamps(self, street: Street) -> Placed:
-        """The lit lamp of every signal whose state is known."""
+        """The lit lamp of every signal whose state is known; after `_things`."""
+        signals = street.signals
+        shown = [signals[post.crossing].walk if post.crossing in signals else None for post, _ in self._posts]
+        if shown != self._lit_for:
+            self._lit_for, self._lit = shown, self._lamps_showing(shown)
+        return self._lit
+
+    def _lamps_showing(self, shown: list[bool | None]) -> Placed:
         lit = {walk: self._forms.id(("signal", walk), partial(_lamp, walk)) for walk in props.LAMPS}
         forms, at, heading, paint = [], [], [], []
-        for tile in self._around:
-            for post, z in zip(tile.posts, tile.post_z.tolist(), strict=True):
-                if post.crossing in street.signals:
-                    walk = street.signals[post.crossing].walk
-                    forms.append(lit[walk])
-                    at.append((post.x_m - self._anchor[0], post.y_m - self._anchor[1], z))
-                    heading.append(post.heading_rad)
-                    paint.append(props.LAMPS[walk])
+        for (post, z), walk in zip(self._posts, shown, strict=True):
+            if walk is not None:
+                forms.append(lit[walk])
+                at.append((post.x_m - self._anchor[0], post.y_m - self._anchor[1], z))
+                heading.append(post.heading_rad)
+                paint.append(props.LAMPS[walk])
         if not forms:
             return _NOTHING
         return np.array(forms), instances(at, heading, paint, LABELS["signal"])
 
-    def _vehicles(self, rows: NDArray[np.intp], which: Vehicles) -> Placed:
-        if len(rows) == 0:
-            return _NOTHING
-        forms = []
-        for i, (length, width) in zip(rows.tolist(), which.size[rows].round(1).tolist(), strict=True):
-            shape = vehicles.shape(which.ids[i], length)
-            forms.append(self._forms.id(("vehicle", shape, length, width), partial(_vehicle, shape, length, width)))
-        lean = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows])
-        at = np.column_stack([which.xy[rows] - self._anchor, lean[:, 0]])
-        paint = np.array([vehicles.paint(which.ids[i]) for i in rows])
-        placed = instances(at, which.heading[rows], paint, LABELS["vehicle"])
+    def _vehicles(self, view: View, middle: Floats, which: Vehicles) -> tuple[Placed, Placed]:
+        """Vehicles in the picture, and those that throw shadows in the square around its middle."""
+        seen = view.sees(which.xy, VEHICLE_MARGIN_M)
+        casts = _near(which.xy, middle, REACH_M)
+        rows = (seen | casts if self._shadows else seen).nonzero()[0]
+        if not len(rows):
+            return _NOTHING, _NOTHING
+        forms, paints = zip(*(self._vehicle_form(which.ids[i], *which.size[i].tolist()) for i in rows), strict=True)
+        xy, heading, form = which.xy[rows], which.heading[rows], np.array(forms)
+        lean = self._ground.road(xy, heading, which.size[rows])
+        placed = instances(np.column_stack([xy - self._anchor, lean[:, 0]]), heading, paints, LABELS["vehicle"])
         if lean.any():
-            placed["turn"] = [_quaternion(r, p, h) for (_, r, p), h in zip(lean, which.heading[rows], strict=True)]
-        return np.array(forms), placed
+            placed["turn"] = [_quaternion(r, p, h) for (_, r, p), h in zip(lean, heading, strict=True)]
+        seen, casts = seen[rows], casts[rows]
+        return (form[seen], placed[seen]), (form[casts], placed[casts])
+
+    def _vehicle_form(self, name: str, length_m: float, width_m: float) -> tuple[int, vehicles.Colour]:
+        """The form of a vehicle, and its paint."""
+        key = name, length_m, width_m
+        if key not in self._fleet:
+            size = tuple(np.array([length_m, width_m]).round(1).tolist())
+            shape = vehicles.shape(name, size[0])
+            form = self._forms.id(("vehicle", shape, *size), partial(_vehicle, shape, *size))
+            self._fleet[key] = form, vehicles.paint(name)
+        return self._fleet[key]
 
     def _robot(self, robot: RobotState) -> Placed:
         """The robot with its base frame at its pose, leaning with the ground."""
@@ -299,13 +318,9 @@ def _set(things: Things, placed: Sequence[Placed]) -> None:
     things.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
 
 
-def _in_wedge(view: View, xy: Floats, margin_m: float) -> list[int]:
-    """Which of (N, 2) points can be in the picture, however far away."""
-    offset = xy - view.eye_m[:2]
-    cos, sin = math.cos(view.heading_rad), math.sin(view.heading_rad)
-    ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
-    wide = aside * math.cos(view.half_angle_rad) - ahead * math.sin(view.half_angle_rad)
-    return [int(i) for i in np.flatnonzero((wide < margin_m) & (ahead > -margin_m))]
+def _near(xy: Floats, middle: Floats, reach_m: float | Floats) -> NDArray[np.bool_]:
+    """Which of (N, 2) points are less than so far from the first two of `middle`."""
+    return np.asarray(np.hypot(xy[:, 0] - middle[0], xy[:, 1] - middle[1]) < reach_m)
 
 
 def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:

@@ -183,38 +183,41 @@ def anchor_of(eye_m: Floats) -> Floats:
 
 def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
     """(4, 4) from metres relative to the anchor to clip space, the first row of the picture below (read top first)."""
-    right, up, ahead = shot.axes
-    tall = np.tan(0.5 * np.radians(shot.fov_deg))
-    wide = tall * shot.size[0] / shot.size[1]
+    wide, tall = shot.half_picture
     far, near = FAR_M, NEAR_M
-    rows = np.stack([right / wide, -up / tall, ahead * (far + near) / (far - near), ahead])
-    eye = shot.eye_m - np.array([*anchor, 0.0])
-    shift = -rows @ eye
-    shift[2] -= 2.0 * far * near / (far - near)
-    return np.column_stack([rows, shift])
+    matrix = np.empty((4, 4))
+    matrix[:3, :3] = shot.axes
+    matrix[3, :3] = matrix[2, :3]
+    matrix[:3, :3] *= ((1.0 / wide,), (-1.0 / tall,), ((far + near) / (far - near),))
+    eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
+    matrix[:, 3] = -matrix[:, :3] @ eye
+    matrix[2, 3] -= 2.0 * far * near / (far - near)
+    return matrix
 
 
 class SceneBlock:
     """The uniform block of a pass."""
 
     def __init__(self, context: moderngl.Context) -> None:
-        self._buffer = context.buffer(reserve=4 * 4 * (4 + 4 + 12))
+        self._rows = np.zeros((4 + 4 + 12, 4), dtype=np.float32)
+        self._light: Lighting | None = None
+        self._buffer = context.buffer(reserve=self._rows.nbytes)
 
     def write(self, clip_from_at: Floats, shadow_from_at: Floats, shot: Shot, anchor: Floats, light: Lighting) -> None:
         """Set it for what is drawn next; matrices (4, 4)."""
-        right, up, ahead = shot.axes
-        tall = np.tan(0.5 * np.radians(shot.fov_deg))
-        wide = tall * shot.size[0] / shot.size[1]
-        rows = [
-            (*(shot.eye_m[:2] - anchor), shot.eye_m[2], 0.0),
-            *light.rows(),
-            (*anchor, 0.0, 0.0),
-            (*right, wide),
-            (*up, tall),
-            (*ahead, 0.0),
-        ]
-        matrices = np.concatenate([clip_from_at.T, shadow_from_at.T])
-        self._buffer.write(np.concatenate([matrices, np.array(rows)]).astype(np.float32).tobytes())
+        rows = self._rows
+        if self._light is not light:
+            self._light, rows[9:16] = light, light.rows()
+        rows[:4], rows[4:8] = clip_from_at.T, shadow_from_at.T
+        rows[8, :2], rows[8, 2] = shot.eye_m[:2] - anchor, shot.eye_m[2]
+        rows[16, :2] = anchor
+        rows[17:, :3] = shot.axes
+        rows[17, 3], rows[18, 3] = shot.half_picture
+        self._buffer.write(rows)
+        self.bind()
+
+    def bind(self) -> None:
+        """What is drawn next reads it as it was written last."""
         self._buffer.bind_to_uniform_block(SCENE_BINDING)
 
     def release(self) -> None:

@@ -106,7 +106,7 @@ void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
 
 
 class Skins:
-    """Bodies in one vertex and one index buffer; they are made when first needed. instances: of person and girth."""
+    """Bodies in one vertex and one index buffer; instances: of person and girth."""
 
     def __init__(
         self,
@@ -118,21 +118,17 @@ class Skins:
         self._context, self._made, self._drawn, self._layout = context, made, drawn, layout
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
-        self._starts: dict[tuple[int, int], tuple[int, int, int]] = {}
         self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
         self._arrays: tuple[moderngl.VertexArray, moderngl.VertexArray] | None = None
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
-        """Count of indices, first index, first vertex."""
-        key = outfit, level
-        if key not in self._starts:
-            made = self._made(outfit, level)
-            first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
-            self._rows.append(corners(made) if isinstance(made, Body) else far_corners(made))
-            self._indices.append(made.triangles.ravel().astype(np.uint32))
-            self._starts[key] = len(self._indices[-1]), first, base
-            self.release()
-        return self._starts[key]
+        """Take in a body: count of indices, first index, first vertex."""
+        made = self._made(outfit, level)
+        first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
+        self._rows.append(corners(made) if isinstance(made, Body) else far_corners(made))
+        self._indices.append(made.triangles.ravel().astype(np.uint32))
+        self.release()
+        return len(self._indices[-1]), first, base
 
     def draw(self, stage: Stage, instances: moderngl.Buffer, commands: moderngl.Buffer, count: int, first: int) -> None:
         """So many indirect draws, from the `first` on."""

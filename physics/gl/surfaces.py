@@ -68,9 +68,10 @@ class SurfaceShaders:
     def place(self, stage: Stage, middle: Floats, anchor: Floats) -> None:
         """Draw at (2,) `middle` in world metres from now on."""
         which = stage != "colour"
-        for uniform, value in ((self._middles[which], middle - anchor), (self._in_world[which], middle)):
+        (x, y), (x0, y0) = middle.tolist(), anchor.tolist()
+        for uniform, value in ((self._middles[which], (x - x0, y - y0)), (self._in_world[which], (x, y))):
             if uniform is not None:
-                uniform.value = tuple(value.tolist())
+                uniform.value = value
 
 
 @lru_cache(maxsize=1)

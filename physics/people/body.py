@@ -123,7 +123,8 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
     )
 
 
-def pieces(outfit: Outfit) -> list[Piece]:
+@lru_cache(maxsize=64)
+def pieces(outfit: Outfit) -> tuple[Piece, ...]:
     """The closed surfaces of a body."""
     build = outfit.build
     parts = trunk(build, outfit.loose_m, outfit.legs)
@@ -135,7 +136,7 @@ def pieces(outfit: Outfit) -> list[Piece]:
     parts += [about_head(piece, build.head) for piece in hair(outfit.hair)]
     if outfit.cap:
         parts += [about_head(piece, build.head) for piece in headgear()]
-    return parts + carried(outfit.carried, outfit.loose_m)
+    return (*parts, *carried(outfit.carried, outfit.loose_m))
 
 
 def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, Literal
 
 import numpy as np
@@ -53,6 +54,11 @@ def skeleton(family: Family) -> Skeleton:
 
 def man_rest_m() -> Floats:
     """(24, 3) joints of a man of 1.75 m in a T: the figure on which bodies are modelled."""
+    return _man_rest_m().copy()
+
+
+@lru_cache(maxsize=1)
+def _man_rest_m() -> Floats:
     rest = np.zeros((24, 3))
     for name, place in _LEFT_HALF.items():
         rest[INDEX[name]] = place

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -58,8 +59,7 @@ class Surface:
 
 def lofted(piece: Piece, level: int) -> Surface:
     """A piece at a level, closed by a fan at both ends."""
-    table = _table(piece.rings)
-    table = _chosen(table, piece.rings_kept[level])
+    table = _chosen(_table(piece.rings), piece.rings_kept[level])
     sides = piece.sides[level]
     boxy = sides % 8 == 0 and float(table[:, 10].mean()) > 2.8
     corners = 0.0 if boxy or sides % 2 else 0.5
@@ -121,6 +121,7 @@ def tube(piece: Piece, level: int) -> Tube:
     return Tube(rows[:, :3], rows[:, 3:6], rows[:, 6:9], ring, triangles, _shares(rows[:, 12:]), rows[:, 36], spreads)
 
 
+@lru_cache(maxsize=256)
 def _sheet(rings: int, sides: int) -> NDArray[np.int32]:
     """(T, 3) triangles between rings of vertices one after another, and to the two poles behind them."""
     n, k = rings, sides
@@ -130,7 +131,9 @@ def _sheet(rings: int, sides: int) -> NDArray[np.int32]:
     sheet = np.moveaxis(np.stack(quads), 0, -1).reshape(-1, 3)
     low = np.stack([np.full(k, n * k), after, around], 1)
     high = np.stack([np.full(k, n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
-    return np.concatenate([sheet, low, high]).astype(np.int32)
+    whole = np.concatenate([sheet, low, high]).astype(np.int32)
+    whole.flags.writeable = False
+    return whole
 
 
 def _shares(rows: Floats) -> Floats:
@@ -166,7 +169,14 @@ def _table(rings: Sequence[Ring]) -> Floats:
 
 
 def _chosen(table: Floats, wanted: int) -> Floats:
-    """The keys, more rings on smooth curves between them, or those keys without which the shape changes most."""
+    """The keys, more rings on smooth curves between them, or the keys without which the shape would change most.
+    Outfits share many pieces: the answer is kept."""
+    return _kept(table.tobytes(), wanted).copy()
+
+
+@lru_cache(maxsize=2048)
+def _kept(rows: bytes, wanted: int) -> Floats:
+    table = np.frombuffer(rows).reshape(-1, _WIDTH)
     if wanted > len(table):
         return _between(table, wanted)
     kept = list(range(len(table)))
@@ -201,12 +211,16 @@ def _loss(table: Floats, before: int, middle: int, after: int) -> float:
 def _between(table: Floats, wanted: int) -> Floats:
     """`wanted` rings: the keys, and in the longest gaps points of a smooth curve through them."""
     way = np.concatenate([[0.0], np.cumsum(_gaps(table))])
-    extra = np.zeros(len(table) - 1, dtype=int)
+    gaps = np.diff(way).tolist()
+    extra = [0] * len(gaps)
+    shares = list(gaps)
     for _ in range(wanted - len(table)):
-        extra[int(np.argmax(np.diff(way) / (extra + 1)))] += 1
+        longest = shares.index(max(shares))
+        extra[longest] += 1
+        shares[longest] = gaps[longest] / (extra[longest] + 1)
     tangent = np.gradient(table, way, axis=0)
     rows = []
-    for i, more in enumerate(extra.tolist()):
+    for i, more in enumerate(extra):
         t = (np.arange(more + 1) / (more + 1))[:, None]
         width = way[i + 1] - way[i]
         low, high = table[i], table[i + 1]

@@ -17,6 +17,7 @@ from physics.people.families import FAMILIES, Family
 from physics.people.looks import family_of
 
 _PACES: Final = np.array(PACES_MPS)
+_APART: Final = np.diff(_PACES)
 _STANDING_MPS: Final = (0.04, PACES_MPS[0])
 """Between these paces a gesture turns into the slowest walk."""
 
@@ -48,19 +49,24 @@ def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
         return Poses(np.zeros((0, 4), np.intp), np.zeros((0, 4), np.float32), np.zeros(0))
     family, stature, size, offset = _facts_of(people.ids)
     pace = relative_pace(people.pace, stature)
-    knot = np.clip(np.searchsorted(_PACES, pace, side="right") - 1, 0, len(_PACES) - 2)
-    faster = np.clip((pace - _PACES[knot]) / (_PACES[knot + 1] - _PACES[knot]), 0.0, 1.0)
-    slow = np.flatnonzero(pace < _PACES[0])
+    knot = _PACES[1:-1].searchsorted(pace, side="right")
+    faster = np.minimum(np.maximum((pace - _PACES[knot]) / _APART[knot], 0.0), 1.0)
+    slow = (pace < _PACES[0]).nonzero()[0]
 
     frame, frames = people.strides % 1.0 * clips.stride_frames, clips.stride_frames
     low = np.minimum(frame.astype(np.intp), frames - 1)
     late = frame - low
     first, second = clips.gaits[family, knot], clips.gaits[family, knot + 1]
     after = (low + 1) % frames
-    rows = np.stack([first + low, first + after, second + low, second + after], axis=1)
-    weights = np.stack([1.0 - late, late, 1.0 - late, late], axis=1)
-    weights[:, :2] *= (1.0 - faster)[:, None]
-    weights[:, 2:] *= faster[:, None]
+    rows, weights = np.empty((len(low), 4), dtype=np.intp), np.empty((len(low), 4))
+    rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = first + low, first + after, second + low, second + after
+    early, slower = 1.0 - late, 1.0 - faster
+    weights[:, 0], weights[:, 1], weights[:, 2], weights[:, 3] = (
+        early * slower,
+        late * slower,
+        early * faster,
+        late * faster,
+    )
     if len(slow):
         _standing(people, time_s, clips, slow, family, pace, offset, rows, weights)
     return Poses(rows, weights.astype(np.float32), size)
@@ -79,7 +85,7 @@ def _standing(
 ) -> None:
     """Let those in (M,) rows `slow` do what they do on the spot: the second half of their frames is a gesture."""
     start, end = _STANDING_MPS
-    share = np.clip((pace[slow] - start) / (end - start), 0.0, 1.0)
+    share = np.minimum(np.maximum((pace[slow] - start) / (end - start), 0.0), 1.0)
     walk = share * share * (3.0 - 2.0 * share)
     frame = (time_s / clips.loop_s + offset[slow]) % 1.0 * clips.loop_frames
     low = np.minimum(frame.astype(np.intp), clips.loop_frames - 1)
