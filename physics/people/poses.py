@@ -61,12 +61,8 @@ def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
     rows, weights = np.empty((len(low), 4), dtype=np.intp), np.empty((len(low), 4))
     rows[:, 0], rows[:, 1], rows[:, 2], rows[:, 3] = first + low, first + after, second + low, second + after
     early, slower = 1.0 - late, 1.0 - faster
-    weights[:, 0], weights[:, 1], weights[:, 2], weights[:, 3] = (
-        early * slower,
-        late * slower,
-        early * faster,
-        late * faster,
-    )
+    weights[:, 0], weights[:, 1] = early * slower, late * slower
+    weights[:, 2], weights[:, 3] = early * faster, late * faster
     if len(slow):
         _standing(people, time_s, clips, slow, family, pace, offset, rows, weights)
     return Poses(rows, weights.astype(np.float32), size)
