@@ -15,6 +15,7 @@ import shapely
 
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import StreetMap, Strip
+from physics.mapped import MappedThings
 from physics.materials import street_of
 from physics.mesh import Mesh, join
 from physics.placement import street_style
@@ -28,6 +29,7 @@ _UNDER_M: Final = 0.6
 _DEEPEST_M: Final = 6.0
 _YARD_M: Final = 3.0
 """Depth of the paved yards between the houses of a street that is paved."""
+_NEAR_M: Final = 4.0
 _BED_M: Final = (0.45, 0.8)
 """Width of the beds at the feet of houses with gardens."""
 
@@ -52,6 +54,8 @@ _COVERS: Final[Mapping[str, tuple[Cover, ...]]] = {
     "ring": (Cover("slabs-square", _SLABS), Cover("concrete-cast", None)),
 }  # fmt: skip
 """What the frontage of a class of streets may be paved with; other classes have gardens."""
+_TOWN: Final = (Cover("slabs-worn", None), Cover("setts", None), Cover("slabs-square", _SLABS))
+"""What lies between sidewalks and the houses of a map that stand near them."""
 _WAYS: Final = (Cover("concrete-cast", None), Cover("pavers-herringbone", (0.56, 0.52, 0.49)), Cover("gravel", None))
 _BEDS: Final = Cover("earth", None)
 
@@ -63,17 +67,19 @@ class Laid(NamedTuple):
     cover: Cover
 
 
-def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
-    """What lies on the open ground of a tile, a few millimetres above it."""
+def frontage_in(street_map: StreetMap, tile: Tile, seed: int, mapped: MappedThings | None = None) -> list[Laid]:
+    """What lies on the open ground of a tile, a few millimetres above it. mapped: shows houses of the map itself."""
     if "ground" not in tile.parts:
         return []
     x0, y0, x1, y1 = square(tile.key)
     reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
+    houses = shapely.buffer(shapely.union_all([] if mapped is None else mapped.houses(reach)), _NEAR_M, quad_segs=2)
+    shapely.prepare(houses)
     areas: dict[Cover, list[shapely.Geometry]] = {}
     for strip in strips:
-        if strip.kind == "sidewalk" and strip.road_side != 0 and strip.frontage_m > 0.0:
-            for cover, area in _of(strip, seed):
+        if strip.kind == "sidewalk":
+            for cover, area in _of(strip, seed, houses):
                 areas.setdefault(cover, []).append(area)
     triangles = tile.parts["ground"]
     found: list[Laid] = []
@@ -85,14 +91,20 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
     return [laid for laid in found if len(laid.mesh)]
 
 
-def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
-    """The frontage of a sidewalk and its driveways."""
+def _of(strip: Strip, seed: int, houses: shapely.Geometry) -> list[tuple[Cover, shapely.Geometry]]:
+    """The frontage of a sidewalk and its driveways. houses: the ground near houses of the map."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])
     line, edge, depth = _line(strip), 0.5 * strip.width_m, min(strip.frontage_m, _DEEPEST_M)
     covers = _COVERS.get(street_style(strip.street_class))
     of_street = np.random.default_rng([seed, zlib.crc32(street_of(strip.id).encode()), 0xF207])
     found: list[tuple[Cover, shapely.Geometry]] = []
-    if covers is not None:
+    if shapely.intersects(houses, line):
+        cover = _TOWN[int(of_street.integers(len(_TOWN)))]
+        around = shapely.buffer(line, edge + _NEAR_M, cap_style="flat", join_style="mitre")
+        found.append((cover, shapely.intersection(around, houses)))
+    elif strip.road_side == 0 or depth <= 0.0:
+        return found
+    elif covers is not None:
         cover = covers[int(of_street.integers(len(covers)))]
         found.append((cover, _beside(line, edge - 0.05, edge + depth + _YARD_M)))
     elif rng.random() < 0.6:

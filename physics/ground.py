@@ -38,7 +38,7 @@ class Ground:
         self.street_map = street_map
         self.seed = seed
         self.roughness = roughness
-        mapped = MappedThings(street_map)
+        self.mapped = mapped = MappedThings(street_map)
         self._frontage = Frontage(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage, mapped)

@@ -65,6 +65,10 @@ class MappedThings:
             found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)
 
+    def houses(self, area: shapely.Geometry) -> list[Polygon]:
+        """Outlines of the buildings that touch an area."""
+        return [self._houses[i].polygon for i in np.sort(self._house_tree.query(area, predicate="intersects")).tolist()]
+
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
         """Whether the map shows things of a kind near a place, so that none need be made up there."""
         tree = self._trees.get(kind)

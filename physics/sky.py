@@ -23,6 +23,8 @@ from physics.clouds import clouded
 from physics.hdri import brightest, read_hdri
 from physics.sun import sun_direction, transmittance
 
+HORIZON_FADE: Final = 0.06
+"""The sine of the angle over which the horizon fades into the ground below it."""
 SKY_SIZE: Final = (256, 512)
 """Rows and columns of a procedural sky."""
 TURBIDITY: Final = 3.0
@@ -127,7 +129,7 @@ def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: floa
     up = irradiance(np.where(above, sky, 0.0), np.array([0.0, 0.0, 1.0])) + lamps * _LAMPS
     ground = GROUND_ALBEDO * (up + beam * max(float(sun[2]), 0.0))
     horizon = _horizon(sky, len(sky) // 2)
-    near = np.exp(-np.maximum(-ways[..., 2:], 0.0) / 0.06)
+    near = np.exp(-np.maximum(-ways[..., 2:], 0.0) / HORIZON_FADE)
     below = sky if light.hdri else ground + (horizon - ground) * near
     whole = np.where(above, sky, below).astype(np.float32)
     compass = ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0])

@@ -65,7 +65,7 @@ def crown(species: Species, height_m: float) -> Crown:
     half, wide = 0.5 * (height_m - low), species.wide * height_m
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
     rays, triangles = _globe()
-    reach = _reach(rays, species, rng) * rng.uniform(0.94, 1.06, len(rays))
+    reach = _reach(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
     at = rays * reach[:, None]
     widest = np.hypot(at[:, 0], at[:, 1]).max()
     bottom, top = at[:, 2].min(), at[:, 2].max()

@@ -6,6 +6,7 @@ whatever was drawn before.
 
 from __future__ import annotations
 
+import math
 from types import TracebackType
 from typing import Final, Self
 
@@ -20,14 +21,14 @@ from cosim.scenario import Light
 from cosim.state import Frame, RobotState, Street
 from physics.gl.backdrop import Backdrop
 from physics.gl.context import context
-from physics.gl.lighting import lighting_of
+from physics.gl.lighting import Lighting, lighting_of
 from physics.gl.scene import Scene
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.gl.shadows import ShadowMaps, middle_of
 from physics.gl.targets import Target
 from physics.lens import drawn, through
 from physics.sky import sky_of
-from physics.view import Shot, check_size, robot_shot, shot
+from physics.view import Shot, View, check_size, robot_shot, shot
 from physics.world import BulletWorld
 
 NOON: Final = Light()
@@ -44,6 +45,7 @@ class GlCamera:
         self.spec, self._pinhole = spec, drawn(spec)
         self._world, self._depth, self._sky = world, depth, sky_of(light, world.ground.seed)
         self._light = lighting_of(self._sky)
+        self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
         self._targets: dict[tuple[int, int], Target] = {}
         self._from_sun: Floats | None = None
@@ -133,7 +135,7 @@ class GlCamera:
                 self._from_sun, self._to_map = from_sun, _TO_TEXTURE @ from_sun
             self._shadows.draw(middle, anchor, self._light, self._scene.draw)
             self._shadows.bind()
-        self._block.write(camera_matrix(taken, anchor), self._to_map, taken, anchor, self._light)
+        self._block.write(camera_matrix(taken, anchor), self._to_map, taken, anchor, self._light_of(taken.view))
         target.use()
         gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
         gl.front_face = "cw"  # the picture is drawn upside down, to be read top first
@@ -142,6 +144,13 @@ class GlCamera:
         self._draw_paint(gl, target)
         gl.depth_func = "<="
         self._backdrop.draw()
+
+    def _light_of(self, view: View) -> Lighting:
+        """The light of a view, its direction to a degree."""
+        key = round(math.degrees(view.heading_rad)), round(math.degrees(view.half_angle_rad))
+        if key not in self._lights:
+            self._lights[key] = self._light.seen(math.radians(key[0]), math.radians(key[1]))
+        return self._lights[key]
 
     def _draw_paint(self, gl: moderngl.Context, target: Target) -> None:
         """Paint changes colours alone: the ground keeps its labels and its depth."""

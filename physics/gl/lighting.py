@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Final
 
 import moderngl
@@ -22,7 +23,8 @@ edge; the bullet camera does the same."""
 @dataclass(frozen=True, slots=True)
 class Lighting:
     """Linear radiances, as in physics.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that looks
-    there; lamps: 0 by day to 1 at night; shadows: whether there are any."""
+    there; horizon: (N, 3) the sky just over the horizon, columns as in physics.sky; lamps: 0 by day to 1 at night;
+    shadows: whether there are any."""
 
     to_sun: Floats
     sun: Floats
@@ -30,10 +32,19 @@ class Lighting:
     side: Floats
     down: Floats
     fog: Floats
+    horizon: Floats
     fog_per_m: float
     exposure: float
     lamps: float
     shadows: bool
+
+    def seen(self, heading_rad: float, half_angle_rad: float) -> Lighting:
+        """The light of a picture: what is far fades into the sky that is behind it, not into the sky all around."""
+        columns = len(self.horizon)
+        turn = math.pi - 2.0 * math.pi * (np.arange(columns) + 0.5) / columns - heading_rad
+        aside = np.abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
+        behind = aside < max(min(half_angle_rad, 0.5 * math.pi), 2.0 * math.pi / columns)
+        return replace(self, fog=self.horizon[behind].mean(axis=0))
 
     def rows(self) -> list[tuple[float, ...]]:
         """What the uniform block `Scene` holds of it, vec4 after vec4."""
@@ -52,8 +63,17 @@ def lighting_of(sky: Sky) -> Lighting:
     """What a sky is to the shaders."""
     up, side, down = sky.ambient
     return Lighting(
-        sky.sun, sky.sun_colour, up, side, down, sky.fog_colour, sky.fog_per_m, sky.exposure, sky.lamps, sky.shadows
-    )
+        sky.sun, sky.sun_colour, up, side, down, sky.fog_colour, _horizon(sky), sky.fog_per_m, sky.exposure, sky.lamps,
+        sky.shadows,
+    )  # fmt: skip
+
+
+def _horizon(sky: Sky) -> Floats:
+    rows = len(sky.radiance)
+    around = sky.radiance[rows // 2 - max(1, rows // 40) : rows // 2].mean(axis=0, dtype=float)
+    # The sun itself is no colour of the haze.
+    limit = 2.0 * np.median(around, axis=0)
+    return np.asarray(np.minimum(around, limit))
 
 
 def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> moderngl.Texture:

@@ -181,9 +181,7 @@ class Scene:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
         tile = self._ground.tile(key)
-        ground = TileBuffers(
-            self._context, self._shaders, ground_parts(self._ground.street_map, tile, self._ground.seed), middle
-        )
+        ground = TileBuffers(self._context, self._shaders, ground_parts(self._ground, tile), middle)
         lines = paint_parts(self._ground.street_map, tile)
         painted = TileBuffers(self._context, self._shaders, lines, middle) if lines else None
         walls = WallBuffers(

@@ -14,6 +14,7 @@ from physics.frontage import frontage_in
 from physics.gl.corners import LAYOUT, corners, joined
 from physics.gl.shading import Stage
 from physics.gl.surfaces import Surfaces, SurfaceShaders
+from physics.ground import Ground
 from physics.materials import PAVINGS
 from physics.mesh import Mesh
 from physics.paint import paint_in
@@ -65,14 +66,13 @@ class GroundPart(NamedTuple):
     tint: tuple[float, float, float] | None = None
 
 
-def ground_parts(street_map: StreetMap, tile: Tile, seed: int) -> list[GroundPart]:
+def ground_parts(ground: Ground, tile: Tile) -> list[GroundPart]:
     """The ground of a tile, a part for each of its surfaces; what lies over another is drawn first."""
-    found = [
-        GroundPart(mesh, cover.layer, "ground", cover.colour) for mesh, cover in frontage_in(street_map, tile, seed)
-    ]
+    laid = frontage_in(ground.street_map, tile, ground.seed, ground.mapped)
+    found = [GroundPart(mesh, cover.layer, "ground", cover.colour) for mesh, cover in laid]
     for name, mesh in tile.parts.items():
         label, colour = surface(name)
-        found.append(GroundPart(mesh, layer_of(name, seed), label, colour if name in PAVINGS else None))
+        found.append(GroundPart(mesh, layer_of(name, ground.seed), label, colour if name in PAVINGS else None))
     return found
 
 

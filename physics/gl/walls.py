@@ -86,7 +86,8 @@ void main() {{
     vec3 own = vec3(0.0);
 #ifdef NIGHT
     float lit = ground_floor || fract(drawn * 29.0) < {_LIT_SHARE} ? side_light.w : 0.0;
-    own = none ? own : vec3({_LAMPLIGHT}) * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
+    vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
+    own = none ? own : vec3({_LAMPLIGHT}) * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
 #endif
     show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
 }}
@@ -172,9 +173,9 @@ def _rows(
             rows["colour"] = *np.rint(255.0 * np.array(colour)), 255.0
             rows["colour"][flat] = 0
         rows["spot"], storeys = _spots(mesh, flat, building.floor_m + CURB_M)
-        rows["kind"] = np.stack(
-            [np.full(len(rows), upper), storeys, mesh.normals @ street > 0.9, np.full(len(rows), chance[0])], 1
-        )
+        # A house of the map may stand on a corner, or in a yard: all its walls have doors.
+        fronted = (mesh.normals @ street > 0.9) | (building.outline is not None)
+        rows["kind"] = np.stack([np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1)
         rows["fronts"] = *fronts, doors, chance[1]
         found.append((rows, mesh.triangles))
     return found
