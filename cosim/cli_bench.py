@@ -8,17 +8,25 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cosim.cli_crowd import bench_crowd
+
 out = Console()
 err = Console(stderr=True)
 
 
 def bench(
     what: Annotated[
-        Literal["environment", "camera"], typer.Argument(help="One environment process, or the cameras side by side.")
+        Literal["environment", "camera", "crowd"],
+        typer.Argument(help="One environment process, the cameras side by side, or how people and vehicles behave."),
     ] = "environment",
     rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
+    cities: Annotated[int, typer.Option(min=1, help="For `crowd`: how many cities.")] = 3,
+    minutes: Annotated[float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")] = 10.0,
 ) -> None:
-    """Measure speed and memory of one environment process, part by part, or the speed of the cameras."""
+    """Measure one environment process, part by part, the cameras, or what people and vehicles do to each other."""
+    if what == "crowd":
+        bench_crowd(cities, minutes)
+        return
     if what == "camera":
         bench_cameras(rounds)
         return

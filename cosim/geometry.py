@@ -38,9 +38,9 @@ def wrap_angles(angles_rad: ArrayLike) -> Floats:
     return np.pi - (np.pi - np.asarray(angles_rad, dtype=float)) % (2.0 * np.pi)
 
 
-def heading_from_sumo(angle_deg: float) -> float:
-    """SUMO's navigational degrees (0 north, clockwise) as a heading in radians."""
-    return wrap_angle(math.radians(90.0 - angle_deg))
+def headings_from_sumo(angles_deg: ArrayLike) -> Floats:
+    """SUMO's navigational degrees (0 north, clockwise) as headings in radians."""
+    return wrap_angles(np.radians(90.0 - np.asarray(angles_deg, dtype=float)))
 
 
 def heading_to_sumo(heading_rad: float) -> float:

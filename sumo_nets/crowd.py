@@ -22,13 +22,14 @@ import numpy as np
 from cosim.errors import EngineError
 from cosim.events import Actor, EventReply
 from cosim.gait import Strides
-from cosim.geometry import Pose, heading_from_sumo
+from cosim.geometry import Pose, headings_from_sumo
 from cosim.giveway import Body
 from cosim.ports import Crowd
 from cosim.scenario import CrowdSpec
 from cosim.state import People, RobotState, Street, Vehicles
 from cosim.streetmap import Port, StreetMap
 from sumo_nets.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.kerbs import Kerbs
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
 from sumo_nets.smooth import PoseFilter
@@ -48,7 +49,7 @@ SIGNAL_CLOCK_S = 3600
 STANDING_MPS = 0.1
 EYE = "robot"
 Row = tuple[float, float, float, float, float]
-"""x m, y m, heading rad, speed m/s, waiting s."""
+"""x m, y m, angle in SUMO's degrees, speed m/s, waiting s."""
 
 tc = libsumo.constants
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -152,6 +153,7 @@ class SumoCrowd(Crowd):
             libsumo.vehicletype.setMinGap(kind, gap_m)
         self._walks = Walks(libsumo, self._map)
         self._signals = Signals(libsumo, self._map)
+        self._kerbs = Kerbs(self._map)
         self._pedestrians = Pedestrians(libsumo, self._map, self._spec, rng_persons, self._closed)
         self._drivers = Drivers(libsumo, self._map, self._spec, rng_vehicles)
         self._serial: Iterator[int] = count()
@@ -172,11 +174,11 @@ class SumoCrowd(Crowd):
         """One subscription each to the persons and to the vehicles around a point that follows the robot."""
         libsumo.poi.add(EYE, x_m, y_m, (0, 0, 0, 0))
         variables = [tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED, tc.VAR_WAITING_TIME]
-        for domain, reach_m in (
-            (tc.CMD_GET_PERSON_VARIABLE, self._spec.radius_m + LINGER_M),
-            (tc.CMD_GET_VEHICLE_VARIABLE, VEHICLE_REACH_M),
+        for domain, reach_m, further in (
+            (tc.CMD_GET_PERSON_VARIABLE, self._spec.radius_m + LINGER_M, [tc.VAR_NEXT_EDGE]),
+            (tc.CMD_GET_VEHICLE_VARIABLE, VEHICLE_REACH_M, []),
         ):
-            libsumo.poi.subscribeContext(EYE, domain, reach_m, variables)
+            libsumo.poi.subscribeContext(EYE, domain, reach_m, variables + further)
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
@@ -192,24 +194,31 @@ class SumoCrowd(Crowd):
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: Body | None) -> Street:
         persons: dict[str, Row] = {}
         vehicles: dict[str, Row] = {}
+        waits: dict[str, str] = {}
         found: dict[str, Any] = libsumo.poi.getContextSubscriptionResults(EYE)
         for name in sorted(found):
             kind = vehicles if name[0] == "v" else persons if name[0] == "c" else None
             values = found[name]
             if kind is not None and (xy := values[tc.VAR_POSITION])[0] > -1e8:
-                heading_rad = heading_from_sumo(values[tc.VAR_ANGLE])
-                kind[name] = (*xy, heading_rad, values[tc.VAR_SPEED], values[tc.VAR_WAITING_TIME])
+                kind[name] = (*xy, values[tc.VAR_ANGLE], values[tc.VAR_SPEED], values[tc.VAR_WAITING_TIME])
+                if kind is persons and self._signals.is_red(ahead := values[tc.VAR_NEXT_EDGE]):
+                    waits[name] = ahead
         self._seen = tuple({i: Seen(v[0], v[1], v[4]) for i, v in kind.items()} for kind in (persons, vehicles))
+        for name, crossing in waits.items():
+            row = persons[name]
+            persons[name] = (*self._kerbs.behind(crossing, row[0], row[1]), *row[2:])
         people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
     def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...], body: Body | None) -> People:
         ids = tuple(persons)
         table = np.array(list(persons.values()), dtype=float).reshape(-1, 5)
-        xy, heading, speed = self._poses.update(ids, table[:, :2], table[:, 2], table[:, 3], body)
         cast = sorted(actors, key=lambda actor: actor.id)
+        others = np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)
+        headings = headings_from_sumo(table[:, 2])
+        xy, heading, speed = self._poses.update(ids, table[:, :2], headings, table[:, 3], body, others)
         names = (*ids, *(a.id for a in cast))
-        places = np.concatenate([xy, np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)])
+        places = np.concatenate([xy, others])
         speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
         return People.of(
             names,
@@ -224,7 +233,7 @@ class SumoCrowd(Crowd):
         """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""
         table = np.array(list(vehicles.values()), dtype=float).reshape(-1, 5)
         size = np.array([self._drivers.size_m(name) for name in vehicles], dtype=float).reshape(-1, 2)
-        heading = table[:, 2]
+        heading = headings_from_sumo(table[:, 2])
         back = 0.5 * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
         return Vehicles.of(tuple(vehicles), table[:, :2] - back, heading, table[:, 3], size)
 

@@ -1,7 +1,8 @@
 """PoseFilter: the poses shown of people whose simulated positions sometimes jump.
 
 SUMO's striping model moves a person by up to metres in one step where strips and corners meet, and flips its angle
-on a sidestep. The shown person walks to where SUMO has it, no faster than a brisk walk, and turns like a body.
+on a sidestep. The shown person walks to where SUMO has it, no faster than a brisk walk, and turns like a body; on
+the way it keeps out of others, of things, and of the robot.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 
 from cosim.geometry import Floats, wrap_angles
 from cosim.giveway import Body, stepped_round
+from sumo_nets.apart import kept_apart
 
 MAX_SPEED_MPS = 2.2
 """The fastest a shown person moves: above every walking speed, so that it catches up."""
@@ -26,6 +28,9 @@ LOOK_AHEAD_S = 0.3
 TURNING_SPEED_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
 
+NOBODY_ELSE: Floats = np.zeros((0, 2))
+NOTHING: Floats = np.zeros((0, 3))
+
 
 @dataclass(slots=True)
 class PoseFilter:
@@ -38,11 +43,19 @@ class PoseFilter:
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
 
     def update(
-        self, ids: tuple[str, ...], xy: Floats, heading: Floats, speed: Floats, body: Body | None = None
+        self,
+        ids: tuple[str, ...],
+        xy: Floats,
+        heading: Floats,
+        speed: Floats,
+        body: Body | None = None,
+        others: Floats = NOBODY_ELSE,
+        things: Floats = NOTHING,
     ) -> tuple[Floats, Floats, Floats]:
         """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
 
         Who is new is shown as simulated; who is missing is forgotten. body: the robot, round which people step.
+        others (K, 2) m: people who are moved by somebody else. things (M, 3): x, y, radius of what stands around.
         """
         row = np.array([self._index.get(name, -1) for name in ids], dtype=np.intp)
         known = row >= 0
@@ -55,6 +68,7 @@ class PoseFilter:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
+        shown = self._apart(before, shown, others, things)
         if body is not None:
             shown = stepped_round(before, shown, body)
         velocity = np.where(known[:, None], (shown - before) / self.period_s, simulated)
@@ -69,3 +83,8 @@ class PoseFilter:
             self._xy, self._heading, self._motion = shown, facing, motion
         self._index = {name: i for i, name in enumerate(ids)}
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
+
+    def _apart(self, before: Floats, shown: Floats, others: Floats, things: Floats) -> Floats:
+        firm = np.arange(len(shown) + len(others)) >= len(shown)
+        before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
+        return kept_apart(before, wanted, firm, things, MAX_SPEED_MPS * self.period_s)[: len(shown)]

@@ -13,8 +13,8 @@ from cosim.geometry import (
     Polyline,
     box_disk_gap,
     boxes_overlap,
-    heading_from_sumo,
     heading_to_sumo,
+    headings_from_sumo,
     wrap_angle,
     wrap_angles,
 )
@@ -34,10 +34,10 @@ def test_wrapped_angles_lie_in_the_half_open_circle_and_agree(angle: float) -> N
 
 def test_sumo_angles_are_clockwise_from_north() -> None:
     """SUMO's 0 is north, its 90 is east, and the conversion goes both ways."""
-    assert math.isclose(heading_from_sumo(0.0), math.pi / 2)
-    assert math.isclose(heading_from_sumo(90.0), 0.0)
+    assert math.isclose(headings_from_sumo(0.0), math.pi / 2)
+    assert math.isclose(headings_from_sumo(90.0), 0.0)
     for degrees in (0.0, 45.0, 200.0, 359.0):
-        assert math.isclose(heading_to_sumo(heading_from_sumo(degrees)), degrees, abs_tol=1e-9)
+        assert math.isclose(heading_to_sumo(headings_from_sumo(degrees)), degrees, abs_tol=1e-9)
 
 
 def test_a_polyline_is_measured_along_itself() -> None:

@@ -1,0 +1,120 @@
+"""Nobody walks through anybody: how shown people keep apart, and out of the poles on the sidewalk.
+
+SUMO's walkers change stripes through one another, and their paths over corners cross. A step that would bring two
+people nearer than KEEP_M is led aside: each gives way by half, an event pedestrian not at all. Where somebody meets
+somebody or something head-on, the step bends to the side on which it would pass; that choice strengthens itself.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from cosim.geometry import Floats
+
+KEEP_M: Final = 0.45
+"""Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
+
+THING_M: Final = 0.25
+"""Least distance of a person's middle from the outline of a thing."""
+
+NEAR_M: Final = 0.6
+"""Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
+
+ROUNDS: Final = 8
+"""One gives way to several in turn, at most so often."""
+
+ENOUGH_M: Final = 0.01
+BENDS: Final = 2
+"""In the first rounds pushes bend aside."""
+
+BEND: Final = 0.6
+"""Way to the side, as a share of the way back, where two walk at each other."""
+
+Complex = NDArray[np.complex128]
+"""Points of the plane, x + iy in metres: turning and measuring are single operations."""
+
+
+def kept_apart(before: Floats, wanted: Floats, firm: NDArray[np.bool_], things: Floats, reach_m: float) -> Floats:
+    """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
+
+    firm (N,): who does not give way. things (M, 3): x, y, radius of round things to keep out of, metres. reach_m: the
+    farthest that anybody goes in this step.
+    """
+    one, other = _pairs(wanted, firm)
+    person, thing = _beside(wanted, firm, things)
+    if not len(one) and not len(person):
+        return wanted
+    start, goal = _points(before), _points(wanted)
+    at, middle = goal.copy(), _points(things[thing, :2])
+    share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
+    share_other = np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
+    apart, off = start[other] - start[one], start[person] - middle
+    bend = _bend(apart, goal[other] - goal[one] - apart)
+    bend_off, keep_off = _bend(off, goal[person] - start[person]), things[thing, 2] + THING_M
+    for k in range(ROUNDS):
+        if k == BENDS:
+            bend, bend_off = np.ones_like(bend), np.ones_like(bend_off)
+        push, most_m = _push(at[other] - at[one], apart, KEEP_M, bend)
+        np.add.at(at, other, share_other * push)
+        np.subtract.at(at, one, share_one * push)
+        if len(person):
+            push, most_off_m = _push(at[person] - middle, off, keep_off, bend_off)
+            np.add.at(at, person, push)
+            most_m = max(most_m, most_off_m)
+        if most_m < ENOUGH_M:
+            break
+    step = at - start
+    at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
+    return np.column_stack([at.real, at.imag])
+
+
+def _points(xy: Floats) -> Complex:
+    return np.ascontiguousarray(xy[:, 0] + 1j * xy[:, 1])
+
+
+def _pairs(xy: Floats, firm: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is too near."""
+    nobody = np.zeros(0, dtype=np.intp)
+    if len(xy) < 2:
+        return nobody, nobody
+    pairs = cKDTree(xy).query_pairs(NEAR_M, output_type="ndarray")
+    if not len(pairs):
+        return nobody, nobody
+    one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
+    gap = xy[one] - xy[other]
+    close = (gap * gap).sum(axis=1) < KEEP_M * KEEP_M
+    moves = ~(firm[one] & firm[other])
+    return (one[moves], other[moves]) if (close & moves).any() else (nobody, nobody)
+
+
+def _beside(xy: Floats, firm: NDArray[np.bool_], things: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Numbers of people and of the things that they are too near to."""
+    if not len(things):
+        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
+    gap = np.abs(_points(xy)[:, None] - _points(things[:, :2])) - things[:, 2]
+    person, thing = np.nonzero((gap < THING_M) & ~firm[:, None])
+    return person, thing
+
+
+def _bend(apart: Complex, step: Complex) -> Complex:
+    """(K,) by what a push is turned aside: to the side on which a step passes; not where the step leads away."""
+    turned = apart.conj() * step
+    side = np.where(turned.imag >= 0.0, 1.0, -1.0)
+    return np.where(turned.real < 0.0, 1.0 + 1j * BEND * side, 1.0 + 0j)
+
+
+def _push(apart: Complex, before: Complex, keep_m: float | Floats, bend: Complex) -> tuple[Complex, float]:
+    """(K,) how to move the second of each pair so that it keeps away, and the most that is lacking in metres.
+
+    apart, before: (K,) from the first of each pair to the second, now and at the beginning of the step.
+    """
+    far = np.abs(apart)
+    lost = np.maximum(keep_m - far, 0.0)
+    # Two at one place part along the line on which they came.
+    line = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
+    push: Complex = lost * line / np.abs(line) * bend
+    return push, float(lost.max(initial=0.0))

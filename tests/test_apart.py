@@ -1,0 +1,65 @@
+"""Nobody walks through anybody, nor through a pole."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sumo_nets.apart import KEEP_M, THING_M, kept_apart
+
+REACH_M = 2.2 * 0.05
+NOTHING = np.zeros((0, 3))
+
+
+def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray, things: np.ndarray = NOTHING) -> list[np.ndarray]:
+    """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps as it wants."""
+    at, track = start.astype(float), []
+    for _ in range(200):
+        away = goal - at
+        far = np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+        at = kept_apart(at, at + away / far * np.minimum(far, 0.07), firm, things, REACH_M)
+        track.append(at)
+    return track
+
+
+@pytest.mark.parametrize("aside_m", [0.0, 0.1, -0.3])
+@pytest.mark.parametrize("firm", [False, True])
+def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: bool) -> None:
+    """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the reach of a step."""
+    start, goal = np.array([[-4.0, 0.0], [4.0, aside_m]]), np.array([[4.0, 0.0], [-4.0, aside_m]])
+    track = walked(start, goal, np.array([firm, False]))
+    assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * KEEP_M
+    assert np.hypot(*(track[-1] - goal).T).max() < 0.05
+    steps = np.diff(np.array([start, *track]), axis=0)
+    assert np.hypot(steps[..., 0], steps[..., 1]).max() <= REACH_M + 1e-9
+
+
+def test_who_is_firm_does_not_give_way() -> None:
+    """An event pedestrian walks its line to the millimetre; the other goes round it."""
+    start, goal = np.array([[-4.0, 0.0], [4.0, 0.0]]), np.array([[4.0, 0.0], [-4.0, 0.0]])
+    track = walked(start, goal, np.array([True, False]))
+    assert all(at[0, 1] == 0.0 for at in track)
+    assert max(abs(float(at[1, 1])) for at in track) > 0.8 * KEEP_M
+
+
+def test_people_walk_round_a_pole() -> None:
+    """A pole of 10 cm in the middle of the way is passed at an arm's length."""
+    pole = np.array([[0.0, 0.0, 0.05]])
+    track = walked(np.array([[-3.0, 0.0]]), np.array([[3.0, 0.0]]), np.array([False]), pole)
+    assert min(float(np.hypot(*at[0])) for at in track) > 0.9 * (0.05 + THING_M)
+    assert abs(float(track[-1][0, 0]) - 3.0) < 0.05
+
+
+def test_a_throng_at_one_place_parts() -> None:
+    """Eight who all want to stand at the same place end up side by side, none in another."""
+    rng = np.random.default_rng(1)
+    track = walked(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
+    gaps = np.hypot(*(track[-1][:, None] - track[-1][None]).transpose(2, 0, 1)) + 9.0 * np.eye(8)
+    assert gaps.min() > 0.3
+
+
+def test_who_is_alone_walks_as_it_wants() -> None:
+    """Without anybody near the very same values come back."""
+    before = np.array([[0.0, 0.0], [2.0, 0.0]])
+    wanted = before + 0.07
+    assert kept_apart(before, wanted, np.zeros(2, dtype=bool), NOTHING, REACH_M) is wanted
