@@ -15,7 +15,7 @@ import numpy as np
 from cosim.record import Ended, Log
 from cosim.referee import Failure
 
-SCHEMA = 1
+SCHEMA = 2
 """Raised whenever a definition changes; results of different schemas are not compared."""
 
 STALLED_MPS = 0.05
@@ -135,6 +135,16 @@ def failure_to_progress(episode: Episode) -> float:
     return float(sum(driven[i : i + window].sum() < PROGRESS_MIN_M for i in windows))
 
 
+def carriageway_time_s(episode: Episode) -> float:
+    """Time with the base centre on a road outside the crossings, or on a crossing whose signal says stop."""
+    return float(episode.log.on_carriageway.sum() * episode.log.tick_s)
+
+
+def vehicles_braked(episode: Episode) -> float:
+    """How often a vehicle had to slow down by more than 2 m/s2 for a robot without green (`cosim.roadway`)."""
+    return float(episode.log.vehicles_braked.sum())
+
+
 def count(kind: str) -> Callable[[Episode], float]:
     """Number of failures of a kind; "" counts all."""
     return lambda episode: float(sum(kind in ("", failure.kind) for failure in episode.failures))
@@ -177,6 +187,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
+        "carriageway_time_s": Metric("s", False, carriageway_time_s),
+        "vehicles_braked": Metric("", False, vehicles_braked),
         "pedestrian_distance_min_m": Metric("m", True, pedestrian_distance_min_m),
         "space_compliance": Metric("", True, space_compliance),
         "personal_space_violation": Metric("", False, personal_space_violation),

@@ -22,6 +22,7 @@ from cosim.geometry import Floats
 from cosim.injection import Injected
 from cosim.ports import Manifest
 from cosim.referee import Failure, Verdict
+from cosim.roadway import OnRoad
 from cosim.scenario import Scenario, content_hash
 from cosim.step import Step
 from cosim.versions import versions
@@ -41,6 +42,7 @@ class Log:
     pose (T, 3) x m, y m, heading rad; speed (T, 2) v m/s, w rad/s; command (T, 2) likewise; route_s_m (T,);
     travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
     reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
+    on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.roadway`.
     people_tick (P,), people_xy (P, 2), people_event (P,) bool: persons within 30 m, once a second, for pictures.
     event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
     """
@@ -54,6 +56,8 @@ class Log:
     person_m: Floats
     reset_s_m: Floats
     waits_at_red: NDArray[np.bool_]
+    on_carriageway: NDArray[np.bool_]
+    vehicles_braked: NDArray[np.int64]
     people_tick: NDArray[np.int64]
     people_xy: Floats
     people_event: NDArray[np.bool_]
@@ -204,7 +208,7 @@ class Recorder:
         self._people: list[tuple[int, float, float, bool]] = []
         self.hash = StateHash()
 
-    def add(self, step: Step, verdict: Verdict) -> None:
+    def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
         robot, people = step.motion.robot, step.street_after.people
         track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
@@ -213,7 +217,8 @@ class Recorder:
         reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
         speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
         measured = (step.route_s_after_m, travelled_m, float(away.min()), reset_s_m, float(verdict.waits_at_red))
-        self._rows.append((*robot.pose, *speeds, *measured))
+        on_road = (float(road.carriageway), float(road.braked))
+        self._rows.append((*robot.pose, *speeds, *measured, *on_road))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             for i in np.flatnonzero(away[: len(people)] < self.PEOPLE_WITHIN_M):
                 x, y = people.xy[i]
@@ -221,7 +226,7 @@ class Recorder:
 
     def log(self, event_tracks: Floats) -> Log:
         """The episode so far. event_tracks: see `Log`."""
-        rows = np.array(self._rows, dtype=float).reshape(-1, 12)
+        rows = np.array(self._rows, dtype=float).reshape(-1, 14)
         people = np.array(self._people, dtype=float).reshape(-1, 4)
         return Log(
             tick_s=self._tick_s,
@@ -233,6 +238,8 @@ class Recorder:
             person_m=rows[:, 9],
             reset_s_m=rows[:, 10],
             waits_at_red=rows[:, 11] > 0,
+            on_carriageway=rows[:, 12] > 0,
+            vehicles_braked=rows[:, 13].astype(np.int64),
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_event=people[:, 3] > 0,

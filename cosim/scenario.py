@@ -92,18 +92,33 @@ class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True):
     signalised: bool
 
 
-class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """The street life around the robot: persons and vehicles kept within radius_m of it."""
+DEFAULT_PERSONS = 50
+MOST_PER_1000_M2 = 150.0
+"""Denser crowds have no room to enter 1.5 m apart."""
 
-    persons: int = 50
+
+class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """The street life around the robot: persons and vehicles kept within radius_m of it.
+
+    density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
+    """
+
+    persons: int = DEFAULT_PERSONS
     radius_m: float = 80.0
     vehicles: int = 20
+    density: float | msgspec.UnsetType = msgspec.UNSET
 
     def __post_init__(self) -> None:
         if self.persons < 0 or self.vehicles < 0:
             raise SpecError(f"persons and vehicles cannot be negative: {self.persons}, {self.vehicles}")
         if not 20.0 <= self.radius_m <= 500.0:
             raise SpecError(f"crowd radius_m must be in [20, 500], not {self.radius_m}")
+        if isinstance(self.density, msgspec.UnsetType):
+            return
+        if not 0.0 <= self.density <= MOST_PER_1000_M2:
+            raise SpecError(f"crowd density must be in [0, {MOST_PER_1000_M2:g}] per 1000 m2, not {self.density}")
+        if self.persons != DEFAULT_PERSONS:
+            raise SpecError(f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both")
 
 
 class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):

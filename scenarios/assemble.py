@@ -21,6 +21,7 @@ from cosim.injection import Injected
 from cosim.loop import Parts
 from cosim.ports import CameraSpec, Director, Eyes, Policy
 from cosim.record import NO_RENDERER
+from cosim.roadway import Roadway
 from cosim.scenario import City, Place, Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
 from physics.cameras import CameraChoice, camera_of, chosen, renderer_of
@@ -45,7 +46,7 @@ FRONTAGE_M = 2.0
 @dataclass(frozen=True, slots=True)
 class Stage:
     """A scenario ready to run. area: where the robot may be, for the referee. renderer: what draws for the policy.
-    eyes: makes further cameras. guests: takes injected pedestrians in."""
+    eyes: makes further cameras. guests: takes injected pedestrians in. roadway: watches the robot among vehicles."""
 
     parts: Parts
     area: WalkableArea
@@ -53,6 +54,7 @@ class Stage:
     renderer: str
     eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
     guests: Guests
+    roadway: Roadway
 
 
 @contextmanager
@@ -92,7 +94,7 @@ def staged(
         shapely.prepare(free)
         guests = Guests(director, clock.tick_ms, partial(on_map, street_map), script)
         parts = Parts(world, crowd, guests, policy, camera, Limits(), free)
-        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests)
+        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests, Roadway(street_map, clock.tick_s))
 
 
 def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:

@@ -80,7 +80,7 @@ def drive(record: Record, scenario: Scenario, stage: Stage, *watches: Watch) -> 
     step = next(run)
     while True:
         verdict = referee.judge(step)
-        recorder.add(step, verdict)
+        recorder.add(step, verdict, stage.roadway.see(step))
         witness.see(step)
         if verdict.failure is not None:
             failures.append(verdict.failure)

@@ -10,6 +10,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+import msgspec
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -18,6 +19,7 @@ from cosim.scenario import CrowdSpec
 from cosim.streetmap import Port, StreetMap
 from cosim.walks import WalkGraph
 from sumo_nets.proxy import END_M, KEEP_ROUTE, MATCH_M
+from sumo_nets.room import Room
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
@@ -123,10 +125,17 @@ class Pedestrians:
             step_m=2.0,
         )
         self._count = 0
+        self._room = Room(street_map, spec.radius_m)
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Everybody at once, before the episode."""
-        self._enter(self._spec.persons, x_m, y_m, CLEAR_M, {})
+        self._enter(self.wanted(x_m, y_m), x_m, y_m, CLEAR_M, {})
+
+    def wanted(self, x_m: float, y_m: float) -> int:
+        """How many persons there should be within the crowd's radius of a point."""
+        if isinstance(self._spec.density, msgspec.UnsetType):
+            return self._spec.persons
+        return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]) -> None:
         """Take out who is far away or stuck, let others in instead.
@@ -140,9 +149,16 @@ class Pedestrians:
             here = seen.get(name)
             if here is None or (here.waiting_s > STUCK_S and not at_red(name)):
                 person.remove(name)
-        inside = sum(np.hypot(p.x_m - x_m, p.y_m - y_m) < radius_m for p in seen.values())
+        away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
+        inside = [name for name, far_m in away_m.items() if far_m < radius_m]
         low_m = min(max(SIGHT_M, radius_m - LINGER_M), radius_m - 10.0)
-        self._enter(min(self._spec.persons - int(inside), PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
+        missing = self.wanted(x_m, y_m) - len(inside)
+        if not isinstance(self._spec.density, msgspec.UnsetType):
+            far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
+            for name in far[: max(-missing, 0)]:
+                if name in person.getIDList():
+                    person.remove(name)
+        self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
 
     def _margin_m(self, port: Port) -> float:
         return self._widths_m[port.strip] + END_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)

@@ -115,6 +115,26 @@ def test_the_crowd_follows_a_robot_that_travels(place: Place) -> None:
     assert len(appeared) > 10 and min(appeared) > 34.0
 
 
+def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
+    """Over 100 m persons per 1000 m2 of walkable ground are as asked for, within 5 % on the mean of every third."""
+    start = middle(place)
+    reach = place.graph.reach(Port(place.map.locate(*start[:2]).edge, 0))
+    path = reach.path(reach.within(130.0, 300.0)[0])
+    assert path is not None
+    line = Polyline([place.graph.point(port) for port in path])
+    pieces = np.array([p.polygon for p in (*place.map.strips.values(), *place.map.corners.values())], dtype=object)
+    found = []
+    with SumoCrowd(place.net, place.map, CrowdSpec(density=40.0, vehicles=0), 5, OPEN, start[:2]) as crowd:
+        for tick in range(1200):
+            pose = line.at(0.08 * tick)
+            street = crowd.step(at(pose), reply(tick))
+            if tick % 40 == 20:
+                disk = shapely.Point(pose.xy).buffer(80.0)
+                room_m2 = shapely.area(shapely.intersection(pieces, disk)).sum()
+                found.append(1000.0 * float((gaps(street, pose) < 80.0).sum()) / room_m2)
+    assert [np.mean(third) for third in np.array_split(found, 3)] == pytest.approx([40.0] * 3, rel=0.05)
+
+
 def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
     """In two minutes beside a standing robot on a sidewalk people pass, and nobody comes nearer than 0.5 m."""
     start = middle(place)

@@ -24,6 +24,7 @@ def log(s_m: list[float], *, resets: dict[int, float] | None = None, person_m: f
         tick_s=0.05, pose=np.column_stack([s, np.zeros(n), np.zeros(n)]),
         speed=np.column_stack([moved / 0.05, np.zeros(n)]), command=np.zeros((n, 2)), route_s_m=s, travelled_m=moved,
         person_m=np.full(n, person_m), reset_s_m=reset, waits_at_red=np.zeros(n, bool),
+        on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
         people_tick=np.zeros(0, np.int64), people_xy=np.zeros((0, 2)), people_event=np.zeros(0, bool),
         event_tracks=np.zeros((0, 5)),
     )  # fmt: skip
@@ -105,6 +106,16 @@ def test_space_metrics_have_the_signs_of_their_names() -> None:
     assert (at_1m["space_compliance"], at_1m["personal_space_violation"]) == (1.0, 1.0)
     assert (at_40cm["space_compliance"], at_40cm["personal_space_violation"]) == (0.0, 1.0)
     assert at_40cm["pedestrian_distance_min_m"] == 0.4
+
+
+def test_time_on_the_carriageway_and_braking_vehicles_are_summed() -> None:
+    """Thirty ticks on the road are 1.5 s; two vehicles that begin to brake at one tick and one later are three."""
+    one = log([0.05 * (i + 1) for i in range(100)])
+    one.on_carriageway[20:50] = True
+    one.vehicles_braked[25], one.vehicles_braked[40] = 2, 1
+    measures = measure(episode(one))
+    assert measures["carriageway_time_s"] == pytest.approx(1.5)
+    assert measures["vehicles_braked"] == 3.0
 
 
 def test_spl_charges_detours() -> None:

@@ -1,0 +1,73 @@
+"""The robot among vehicles, on a road of 8 m with one crossing, worked out by hand."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+import shapely
+
+from cosim.events import EventReply
+from cosim.geometry import Pose
+from cosim.roadway import OnRoad, Roadway, braking_for
+from cosim.state import STILL, Motion, People, RobotState, Signal, Street, Vehicles
+from cosim.step import Step
+from cosim.streetmap import Lane, StreetMap, Strip
+
+LINE = np.array([[20.0, -4.0], [20.0, 4.0]])
+CROSSING = Strip(":j_c0", "crossing", LINE, 4.0, shapely.box(18.0, -4.0, 22.0, 4.0), (None, None), signalised=True)
+LANE = Lane("r_0", "r", "road", np.array([[-50.0, 0.0], [50.0, 0.0]]), 8.0, shapely.box(-50.0, -4.0, 50.0, 4.0))
+MAP = StreetMap("m", (-50.0, -9.0, 50.0, 9.0), {":j_c0": CROSSING}, {}, {"r_0": LANE}, {})
+
+
+def street(speed_mps: float, walk: bool | None = None, people: People | None = None) -> Street:
+    """A car whose bumper is at x = 2, heading east; the crossing's signal, None for an unsignalised one."""
+    car = Vehicles.of(("v0",), [[0.0, 0.0]], [0.0], [speed_mps], [[4.0, 2.0]])
+    signals = {} if walk is None else {":j_c0": Signal(walk)}
+    return Street(0, People.of((), [], [], [], ()) if people is None else people, car, MappingProxyType(signals))
+
+
+def step(tick: int, x_m: float, y_m: float, before: Street, after: Street) -> Step:
+    robot = RobotState(Pose(x_m, y_m, 0.0))
+    reply = EventReply(episode="", tick=tick, states=(), actors=())
+    return Step(tick, robot, before, 0.0, None, STILL, reply, Motion(robot, np.zeros((1, 3))), after, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("x_m", "y_m", "walk", "on_road"),
+    [(10.0, 0.0, True, True), (20.0, 0.0, True, False), (20.0, 0.0, False, True), (20.0, 0.0, None, False),
+     (10.0, 6.0, True, False)],
+)  # fmt: skip
+def test_the_carriageway_is_the_road_and_the_red_crossing(
+    x_m: float, y_m: float, walk: bool | None, on_road: bool
+) -> None:
+    """On the road, on a green, a red and an unsignalised crossing, and beside the road."""
+    after = street(8.0, walk)
+    assert Roadway(MAP, 0.05).see(step(0, x_m, y_m, after, after)).carriageway is on_road
+
+
+def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
+    """A car that loses 3 m/s2 before a robot on the road is counted at the first tick, and anew after two seconds."""
+    roadway = Roadway(MAP, 0.05)
+    ticks = (0, 1, 2, 60)
+    seen = [roadway.see(step(tick, 12.0, 0.5, street(8.0), street(7.85))) for tick in ticks]
+    assert seen == [OnRoad(True, 1), OnRoad(True, 0), OnRoad(True, 0), OnRoad(True, 1)]
+
+
+def test_only_hard_braking_for_the_next_in_the_way_counts() -> None:
+    """Not 1 m/s2, not for a robot beside the way or behind, not when a person is nearer."""
+    robot = Pose(12.0, 0.5, 0.0)
+    person = People.of(("c0",), [[8.0, 0.0]], [0.0], [1.0], ("walk",))
+    assert braking_for(robot, street(8.0), street(7.85), 0.05) == ["v0"]
+    assert braking_for(robot, street(8.0), street(7.95), 0.05) == []
+    assert braking_for(Pose(12.0, 3.0, 0.0), street(8.0), street(7.85), 0.05) == []
+    assert braking_for(Pose(-9.0, 0.0, 0.0), street(8.0), street(7.85), 0.05) == []
+    assert braking_for(robot, street(8.0), street(7.85, people=person), 0.05) == []
+
+
+def test_a_green_crossing_makes_nobody_brake() -> None:
+    """Cars that stop while the robot crosses at green stop for their own light; at red they stop for the robot."""
+    for walk, braked in ((True, 0), (False, 1)):
+        seen = Roadway(MAP, 0.05).see(step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk)))
+        assert seen.braked == braked
