@@ -9,6 +9,8 @@ from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
+import shapely
+from shapely.geometry import LineString
 
 from cosim.errors import CosimError, MapError, SpecError
 from cosim.events import GROUPS, Event, Kind
@@ -16,14 +18,16 @@ from cosim.geometry import Floats, Polyline
 from cosim.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Port, StreetMap, Strip
 from cosim.walks import WalkGraph
-from cosim.wayline import way_line
 from scenarios.long_horizon import route_crossings
 
 TRIES = 400
 LIMIT_S = 60.0
 CROWD = CrowdSpec(persons=12, radius_m=80.0, vehicles=8)
-BEFORE_CROSSING_M = 5.0
-"""Way driven before a crosswalk, and after it."""
+BESIDE_CROSSING_M = (2.0, 5.0)
+"""Way driven before a crosswalk and after it, least and most."""
+ROOM_M = 0.35
+"""Half the width of what is walkable there."""
+SHORTEST_M = 10.0
 ENDS_CLEAR_M = 6.0
 """Way and event keep this far from the ends of their sidewalk."""
 BEND_M = 0.15
@@ -142,23 +146,12 @@ def _over_crossing(
         raise SpecError("crossing too short or too long")
     if strip.signalised:
         raise SpecError("crossing signalised: waiting there takes longer than the episode")
-    way = [_beside(street_map, strip, 0 if leave else 1, rng), Port(strip.id, 0 if leave else 1)]
-    way += [Port(strip.id, leave), _beside(street_map, strip, leave, rng)]
-    line = way_line(street_map, way, BEFORE_CROSSING_M, BEFORE_CROSSING_M)
-    route = Polyline(np.round(line.points, 3))
-    crossings = route_crossings(street_map, route, way)
-    if len(crossings) != 1:
-        raise SpecError("crossing not passed once")
-    lead_m = 0.5 * (20.0 - (crossings[0].leave_s_m - crossings[0].enter_s_m))
-    first_m = max(crossings[0].enter_s_m - lead_m, 0.0)
-    last_m = min(crossings[0].leave_s_m + lead_m, route.length_m)
-    route = Polyline(np.round([route.at(float(s)).xy for s in np.arange(first_m, last_m, 0.99)], 3))
-    crossings = tuple(
-        msgspec.structs.replace(c, enter_s_m=c.enter_s_m - first_m, leave_s_m=c.leave_s_m - first_m) for c in crossings
-    )
+    ends = strip.line[[0, -1], :2] if leave else strip.line[[-1, 0], :2]
+    route = Polyline(np.round(_straight_over(street_map, ends), 3)).resampled(0.99)
+    route = Polyline(np.round(route.points, 3))
+    crossings = route_crossings(street_map, route, [Port(strip.id, 0 if leave else 1), Port(strip.id, leave)])
     middle_m = 0.5 * (crossings[0].enter_s_m + crossings[0].leave_s_m)
     pose = route.at(middle_m)
-    ends = strip.line[[0, -1], :2] if leave else strip.line[[-1, 0], :2]
     along = ends[1] - ends[0]
     event = Event(
         id="e0",
@@ -176,17 +169,23 @@ def _over_crossing(
     return _scenario(place, street_map, route.points, event, crossings, seed, scenario_id)
 
 
-def _beside(street_map: StreetMap, strip: Strip, end: int, rng: np.random.Generator) -> Port:
-    """A sidewalk's port at the corner at one end of a crossing."""
-    corner = street_map.corners[strip.corners[end] or ""]
-    ports = [
-        p
-        for p in corner.ports
-        if street_map.strips[p.strip].kind == "sidewalk" and street_map.strips[p.strip].length_m > 8.0
-    ]
-    if not ports:
-        raise SpecError("crossing leads to no sidewalk")
-    return ports[int(rng.integers(len(ports)))]
+def _straight_over(street_map: StreetMap, ends: Floats) -> Floats:
+    """(2, 2) m: a way straight over a crosswalk, from before its first end to beyond its second, as far as one can walk
+    straight on there: who only drives straight ahead stays on it. Raises SpecError when that is too short."""
+    along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+    walkable = street_map.walkable_near(shapely.buffer(LineString(ends), BESIDE_CROSSING_M[1] + 1.0))
+    reached = []
+    for end, outward in ((ends[0], -along), (ends[1], along)):
+        for far_m in np.arange(BESIDE_CROSSING_M[1], BESIDE_CROSSING_M[0] - 1e-9, -0.25):
+            beyond = shapely.buffer(LineString([end, end + far_m * outward]), ROOM_M)
+            if shapely.covers(walkable, beyond):
+                reached.append(end + far_m * outward)
+                break
+        else:
+            raise SpecError("no room straight on beside the crossing")
+    if np.hypot(*(reached[1] - reached[0])) < SHORTEST_M:
+        raise SpecError("way over the crossing too short")
+    return np.array(reached)
 
 
 def _scenario(

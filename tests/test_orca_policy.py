@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -14,10 +15,10 @@ from cosim.geometry import Polyline, Pose
 from cosim.loop import ask
 from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
-from cosim.policies.orca import STOP_BEFORE_M, Orca, lane_past, stop_limit
+from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
 from cosim.ports import Observation, Privileged
 from cosim.scenario import City
-from cosim.state import NO_VEHICLES, Doing, People, RobotState
+from cosim.state import NO_VEHICLES, Doing, People, RobotState, Vehicles
 
 CITY = City(seed=1, size_m=500.0)
 ROUTE = Polyline([(0.0, 0.0), (30.0, 0.0)])
@@ -94,6 +95,16 @@ def test_somebody_who_walks_at_the_robot_is_foreseen_to_aim_at_it_and_then_to_co
     apart = np.hypot(*(track[:STEPS] - np.vstack([[5.0, 0.0], ahead.pose[:-1, 0, :2]])).T)
     assert np.ptp(np.unwrap(heading[apart < COMMITS_M - 0.6])) < 1e-9
     assert np.ptp(np.unwrap(heading[apart > COMMITS_M])) > 0.05
+
+
+def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_half_a_metre() -> None:
+    """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every plan's way alike."""
+    plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
+    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2)))
+    for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
+        cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
+        scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
+        assert car_nearness(scene, ahead)[0] == pytest.approx(nearness)
 
 
 @pytest.mark.engine

@@ -62,6 +62,8 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
         assert 1.1 <= event.speed_mps <= 1.65
         states = react(first_query(scenario)).states
         assert states[0].phase == "waiting"
+        chord = Polyline([scenario.start[:2], scenario.goal])
+        assert max(abs(chord.project(x, y)[1]) for x, y in scenario.route) < 0.2
 
 
 def first_query(scenario: Scenario) -> EventQuery:

@@ -24,7 +24,7 @@ from cosim.geometry import Floats, Polyline, wrap_angles
 from cosim.orca import best_velocity, half_plane
 from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, standing
-from cosim.policies.route import BODY_RADIUS_M, SEEN_M, car_disks, crossing_limit
+from cosim.policies.route import BODY_RADIUS_M, CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
 from cosim.ports import Manifest, Observation, Privileged
 from cosim.state import PERSON_RADIUS_M, Command, People
 
@@ -50,6 +50,7 @@ LATER_M_PER_S: Final = 0.04
 NEARNESS_COST: Final = 15.0
 TOUCH_COST: Final = 60.0
 """m/s given up per metre nearer than the clearance, and nearer than a hand's breadth."""
+CAR_DEEP_M: Final = 0.5
 LANE_COST: Final = 0.25
 CHANGE_COST: Final = 0.4
 FOLLOWED: Final = 0.6
@@ -137,7 +138,7 @@ class Orca:
         nearness = NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
         touch = TOUCH_COST * np.maximum(0.05 - gaps, 0.0)
         scores: Floats = weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
-        scores -= weights.edge * out
+        scores -= weights.edge * out + NEARNESS_COST * car_nearness(known, ahead)
         return scores
 
     def _way_of(self, known: Privileged) -> Way:
@@ -255,24 +256,49 @@ def all_plans(lanes: Floats, limit_mps: float) -> Plans:
 def foreseen(known: Privileged, way: Way, plans: Plans, people: People, ends: Floats) -> tuple[Ahead, Floats]:
     """What becomes of the plans, and the smallest gap (K,) m of each between the body and anybody."""
     moving = ~standing(people)
-    cars_xy, cars_mps, cars_m = car_disks(known)
-    xy = np.concatenate([people.xy[moving], cars_xy])
+    xy, velocity = people.xy[moving], followed(known, people)[moving]
     robot = known.robot
-    velocity = np.concatenate([followed(known, people)[moving], cars_mps])
-    radii = np.concatenate([np.full(int(moving.sum()), PERSON_RADIUS_M), cars_m])
     ahead = foresee(way, plans, robot.pose, known.route_s_m, (robot.v_mps, robot.w_radps), xy, velocity)
-    heading = ahead.pose[..., 2]
-    nose = NOSE_M * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     gaps = np.full(ahead.s_m.shape, np.inf)
-    for body in (ahead.pose[..., :2] + nose, ahead.pose[..., :2] - nose):
-        if len(radii):
+    for body in bodies(ahead):
+        if len(xy):
             away = ahead.people - body[:, :, None]
-            apart = np.sqrt(np.einsum("...i,...i", away, away)) - radii
+            apart = np.sqrt(np.einsum("...i,...i", away, away)) - PERSON_RADIUS_M
             gaps = np.minimum(gaps, apart.min(axis=-1) - BODY_RADIUS_M)
         if len(ends):
             gaps = np.minimum(gaps, (distances(body, ends) - PERSON_RADIUS_M - BODY_RADIUS_M).min(axis=-1))
     later = LATER_M_PER_S * STEP_S * np.arange(1, STEPS + 1)[:, None]
     return ahead, (gaps + later).min(axis=0)
+
+
+def bodies(ahead: Ahead) -> tuple[Floats, Floats]:
+    """(STEPS, K, 2) m each: the middles of the two disks of the body."""
+    heading = ahead.pose[..., 2]
+    nose = NOSE_M * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    return ahead.pose[..., :2] + nose, ahead.pose[..., :2] - nose
+
+
+def car_nearness(known: Privileged, ahead: Ahead) -> Floats:
+    """(K,) m: how much nearer than the clearance each plan comes to vehicles that brake for it, at most CAR_DEEP_M.
+
+    Who enters a crossing only when every car near can still stop (`crossing_limit`) may count on their stopping; what
+    remains is to keep away from where they do. All plans near a car being bad must not hide how bad each is to people.
+    """
+    xy, velocity, radii = car_disks(known)
+    if not len(xy):
+        return np.zeros(ahead.s_m.shape[1])
+    speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-9)
+    time_s = STEP_S * np.arange(1, STEPS + 1)[:, None]
+    braked_s = np.minimum(time_s, speed / CAR_BRAKE_MPS2)
+    driven_m = speed * braked_s - 0.5 * CAR_BRAKE_MPS2 * braked_s**2
+    cars = xy + driven_m[..., None] * (velocity / speed[:, None])
+    gaps = np.full(ahead.s_m.shape, np.inf)
+    for body in bodies(ahead):
+        away = cars[:, None] - body[:, :, None]
+        apart = np.sqrt(np.einsum("...i,...i", away, away)) - radii
+        gaps = np.minimum(gaps, apart.min(axis=-1) - BODY_RADIUS_M)
+    nearness: Floats = np.clip(CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
+    return nearness
 
 
 def outside(way: Way, room: shapely.Geometry, ahead: Ahead) -> Floats:
