@@ -110,9 +110,15 @@ def square(key: Key) -> tuple[float, float, float, float]:
 
 def keys_within(x_m: float, y_m: float, radius_m: float) -> list[Key]:
     """Tiles with a point within `radius_m` of (x_m, y_m), row by row."""
+    return [key for _, key in distances_within(x_m, y_m, radius_m)]
+
+
+def distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[float, Key]]:
+    """The tiles of `keys_within`, each with its distance."""
     (i0, j0), (i1, j1) = key_at(x_m - radius_m, y_m - radius_m), key_at(x_m + radius_m, y_m + radius_m)
     keys = [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1)]
-    return [key for key in keys if distance_to(key, x_m, y_m) <= radius_m]
+    found = [(distance_to(key, x_m, y_m), key) for key in keys]
+    return [one for one in found if one[0] <= radius_m]
 
 
 def distance_to(key: Key, x_m: float, y_m: float) -> float:

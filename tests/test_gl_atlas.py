@@ -46,6 +46,26 @@ def test_an_atlas_holds_the_pictures_of_its_cameras() -> None:
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
 
 
+def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
+    """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they move."""
+    from physics.gl.alone import PeopleAlone
+
+    busy = busy_street(place_of(300.0), 8, 3)
+    with PeopleAlone((96, 54), 60.0) as eyes:
+        single = [eyes.render(busy.robot.pose, street) for street in busy.streets]
+        found = []
+        for street in busy.streets:
+            eyes.begin(busy.robot.pose, street)
+            if street.tick:
+                found.append(eyes.end())
+        found.append(eyes.end())
+        with pytest.raises(EngineError, match="under way"):
+            eyes.end()
+    for one, other in zip(single, found, strict=True):
+        assert np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+    assert not np.array_equal(found[0].rgb, found[2].rgb)
+
+
 def test_an_atlas_too_large_is_refused_with_the_limit() -> None:
     """More rows than a texture may have."""
     from physics.gl.atlas import Atlas

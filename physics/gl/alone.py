@@ -16,7 +16,7 @@ from physics.gl.context import context
 from physics.gl.crowd import Crowd
 from physics.gl.lighting import lighting_of
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
-from physics.gl.targets import Target
+from physics.gl.targets import Readback, Target
 from physics.sky import sky_of
 from physics.view import shot
 
@@ -34,6 +34,7 @@ class PeopleAlone:
     def __enter__(self) -> Self:
         with context() as gl:
             self._crowd, self._block, self._target = Crowd(gl, False), SceneBlock(gl), Target(gl, self._size)
+            self._readback = Readback(gl, self._size)
         self._context = gl
         return self
 
@@ -41,11 +42,16 @@ class PeopleAlone:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._context:
-            for thing in (self._crowd, self._block, self._target):
+            for thing in (self._crowd, self._block, self._target, self._readback):
                 thing.release()
 
     def render(self, pose: Pose, street: Street) -> Frame:
         """The people of a street as seen from a pose."""
+        self.begin(pose, street)
+        return self.end()
+
+    def begin(self, pose: Pose, street: Street) -> None:
+        """Draw them; `end` hands the picture over, and the next one may begin before that."""
         ahead = np.array([np.cos(pose.heading_rad), np.sin(pose.heading_rad)])
         eye = np.append(pose.xy, EYE_M)
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
@@ -61,4 +67,10 @@ class PeopleAlone:
             gl.front_face = "cw"
             gl.depth_func = "<"
             self._crowd.draw("colour")
-            return Frame(*self._target.read())
+            self._readback.begin()
+            self._readback.copy(self._target)
+
+    def end(self) -> Frame:
+        """The picture that began first and has not ended."""
+        with self._context:
+            return Frame(*self._readback.end()[0])

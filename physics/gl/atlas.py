@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Sequence
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Final, Self
+from typing import Self
 
 import moderngl
 
@@ -21,13 +21,10 @@ from cosim.scenario import Light
 from cosim.state import Frame, RobotState, Street
 from physics.gl.camera import NOON, GlCamera
 from physics.gl.context import context
-from physics.gl.targets import Target, parted
+from physics.gl.targets import Readback, Target
 from physics.lens import drawn
 from physics.view import SIDE_MAX
 from physics.world import BulletWorld
-
-UNDER_WAY: Final = 2
-"""Pictures that may have begun and not ended."""
 
 Seen = Sequence[tuple[RobotState, Street]]
 """A robot and its street for each environment."""
@@ -44,17 +41,14 @@ class Atlas:
             )
         self._cameras = [GlCamera(world, spec, light=light) for world in worlds]
         self._running = ExitStack()
-        self._begun: deque[tuple[moderngl.Buffer, Seen]] = deque()
+        self._begun: deque[Seen] = deque()
         self._context: moderngl.Context | None = None
 
     def __enter__(self) -> Self:
         for camera in self._cameras:
             self._running.enter_context(camera)
-        width, height = self._size
         with context() as gl:
-            self._target = Target(gl, self._size)
-            room = width * height * 4 * len(self._cameras)
-            self._free = [gl.buffer(reserve=room) for _ in range(UNDER_WAY)]
+            self._target, self._readback = Target(gl, self._size), Readback(gl, self._size, len(self._cameras))
         self._context = gl
         return self
 
@@ -64,8 +58,7 @@ class Atlas:
         if self._context is not None:
             with self._context:
                 self._target.release()
-                for buffer in (*self._free, *(buffer for buffer, _ in self._begun)):
-                    buffer.release()
+                self._readback.release()
             self._context = None
         self._running.close()
 
@@ -76,27 +69,25 @@ class Atlas:
 
     def begin(self, seen: Seen) -> None:
         """Draw what every robot sees; `end` hands the pictures over."""
-        if self._context is None or not self._free:
-            raise EngineError("the atlas is not running, or has too many pictures under way: `end` some first")
-        with self._context:
-            buffer = self._free.pop()
+        with self._running_context:
+            self._readback.begin()
             for i, (camera, (robot, street)) in enumerate(zip(self._cameras, seen, strict=True)):
                 self._target.clear()
                 camera.draw_into(self._target, robot, street)
-                self._target.read_into(buffer, i * 4 * self._size[0] * self._size[1])
-        self._begun.append((buffer, seen))
+                self._readback.copy(self._target, i)
+        self._begun.append(seen)
 
     def end(self) -> list[Frame]:
         """The pictures that began first and have not ended."""
-        if self._context is None or not self._begun:
-            raise EngineError("no picture of the atlas is under way: `begin` one first")
-        buffer, seen = self._begun.popleft()
-        with self._context:
-            data = memoryview(buffer.read())
-        self._free.append(buffer)
-        each = len(data) // len(self._cameras)
-        frames = [Frame(*parted(data[i * each : (i + 1) * each], self._size)) for i in range(len(self._cameras))]
+        with self._running_context:
+            pictures = self._readback.end()
         return [
-            camera.through_lens(frame, robot, street)
-            for camera, frame, (robot, street) in zip(self._cameras, frames, seen, strict=True)
+            camera.through_lens(Frame(*picture), robot, street)
+            for camera, picture, (robot, street) in zip(self._cameras, pictures, self._begun.popleft(), strict=True)
         ]
+
+    @property
+    def _running_context(self) -> moderngl.Context:
+        if self._context is None:
+            raise EngineError("the atlas is not running: use Atlas in a 'with' block")
+        return self._context

@@ -30,7 +30,7 @@ from physics.gl.tiles import TileBuffers, ground_parts, paint_parts, tile_shader
 from physics.gl.walls import WallBuffers, wall_shaders
 from physics.ground import Ground
 from physics.robots import RobotModel
-from physics.tiles import Key, distance_to, keys_within, square
+from physics.tiles import Key, distance_to, distances_within, keys_within, square
 from physics.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
 
 CAST_M: Final = 18.0
@@ -166,7 +166,7 @@ class Scene:
 
     def _stream(self, view: View) -> None:
         x, y = float(view.eye_m[0]), float(view.eye_m[1])
-        keys = [key for _, key in sorted((distance_to(key, x, y), key) for key in keys_within(x, y, VISIBLE_M))]
+        keys = [key for _, key in sorted(distances_within(x, y, VISIBLE_M))]
         if keys != self._keys:
             for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
                 self._tiles.pop(key).release()

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.geometry import Floats
-from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Stage, programs
+from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined
@@ -50,7 +50,7 @@ class Surfaces:
 class SurfaceShaders:
     """Programs that look surfaces up, for buffers whose positions are relative to the middle of their tile.
 
-    vertex: declares the uniforms `middle` (from the anchor), and `middle_in_world` where it needs that.
+    vertex: declares `in vec2 middle` (from the anchor), and `in vec2 middle_in_world` where it needs that.
     """
 
     def __init__(
@@ -58,20 +58,27 @@ class SurfaceShaders:
     ) -> None:
         self.surfaces = surfaces
         self.programs = programs(context, KNOWN + vertex, LOOKED_UP + fragment, shadows)
-        self._middles, self._in_world, known = (
-            self.programs.uniforms(name) for name in ("middle", "middle_in_world", "layers")
-        )
-        for uniform in known:
+        for uniform in self.programs.uniforms("layers"):
             if uniform is not None:
                 uniform.write(surfaces.known)
 
-    def place(self, stage: Stage, middle: Floats, anchor: Floats) -> None:
-        """Draw at (2,) `middle` in world metres from now on."""
-        which = stage != "colour"
-        (x, y), (x0, y0) = middle.tolist(), anchor.tolist()
-        for uniform, value in ((self._middles[which], (x - x0, y - y0)), (self._in_world[which], (x, y))):
-            if uniform is not None:
-                uniform.value = value
+
+class Spot:
+    """Where a tile is, as its programs read it. middle: (2,) world metres."""
+
+    def __init__(self, context: moderngl.Context, middle: Floats) -> None:
+        self._middle, self._anchor = middle, np.full(2, np.nan)
+        self._buffer = context.buffer(reserve=16)
+        self.content = self._buffer, "2f 2f /i", "middle", "middle_in_world"
+
+    def seen_from(self, anchor: Floats) -> None:
+        """Be at the middle from (2,) `anchor` on."""
+        if anchor is not self._anchor:
+            self._anchor = anchor
+            self._buffer.write(np.concatenate([self._middle - anchor, self._middle]).astype(np.float32))
+
+    def release(self) -> None:
+        self._buffer.release()
 
 
 @lru_cache(maxsize=1)

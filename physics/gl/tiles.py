@@ -13,7 +13,7 @@ from cosim.streetmap import StreetMap
 from physics.frontage import frontage_in
 from physics.gl.corners import LAYOUT, corners, joined
 from physics.gl.shading import Stage
-from physics.gl.surfaces import Surfaces, SurfaceShaders
+from physics.gl.surfaces import Spot, Surfaces, SurfaceShaders
 from physics.ground import Ground
 from physics.materials import PAVINGS
 from physics.mesh import Mesh
@@ -26,8 +26,7 @@ _TINTED: Final = 128
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
-uniform vec2 middle;
-uniform vec2 middle_in_world;
+in vec2 middle; in vec2 middle_in_world;
 out vec3 at; out vec3 normal; out vec2 spot; flat out vec3 tint; flat out vec2 layer_label;
 void main() {
     int layer = int(in_normal.w * 255.0 + 0.5);
@@ -87,7 +86,6 @@ class TileBuffers:
     def __init__(
         self, context: moderngl.Context, shaders: SurfaceShaders, ground: Sequence[GroundPart], middle: Floats
     ) -> None:
-        self._middle = middle
         parts = []
         for mesh, layer, label, tint in ground:
             here = mesh.moved((*-middle, 0.0))
@@ -95,16 +93,16 @@ class TileBuffers:
             rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
             parts.append((here, rows))
         rows, triangles = joined(parts)
-        self._shaders = shaders
+        self._spot = Spot(context, middle)
         self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
-        content = [(self._corners, *LAYOUT)]
+        content = [(self._corners, *LAYOUT), self._spot.content]
         self._arrays = [
             context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders.programs
         ]
 
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if stage != "moving":
-            self._shaders.place(stage, self._middle, anchor)
+            self._spot.seen_from(anchor)
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
@@ -112,3 +110,4 @@ class TileBuffers:
             array.release()
         self._corners.release()
         self._triangles.release()
+        self._spot.release()

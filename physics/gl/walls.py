@@ -20,7 +20,7 @@ from cosim.state import LABELS
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, facade_meshes
 from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
-from physics.gl.surfaces import Surfaces, SurfaceShaders
+from physics.gl.surfaces import Spot, Surfaces, SurfaceShaders
 from physics.mesh import Mesh
 from physics.placement import street_style
 from physics.textures.facade_canvas import BAY_M, STOREY_M
@@ -45,7 +45,7 @@ _LEAST_M: Final = 2.2
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
-uniform vec2 middle;
+in vec2 middle;
 out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
 flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts;
 void main() {
@@ -110,7 +110,7 @@ class WallBuffers:
         street_map: StreetMap,
         middle: Floats,
     ) -> None:
-        self._shaders, self._middle = shaders, middle
+        self._spot = Spot(context, middle)
         parts = [rows for b in buildings for rows in _rows(b, style_of(b, street_map), shaders.surfaces, middle)]
         self._arrays: list[moderngl.VertexArray] = []
         self._buffers: list[moderngl.Buffer] = []
@@ -120,14 +120,14 @@ class WallBuffers:
         indices = [triangles.ravel() + start for (_, triangles), start in zip(parts, starts, strict=False)]
         held = np.concatenate([rows for rows, _ in parts]), np.concatenate(indices).astype(np.uint32)
         self._buffers = [context.buffer(array.tobytes()) for array in held]
-        content = [(self._buffers[0], *_LAYOUT)]
+        content = [(self._buffers[0], *_LAYOUT), self._spot.content]
         self._arrays = [
             context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in shaders.programs
         ]
 
     def draw(self, stage: Stage, anchor: Floats) -> None:
         if self._arrays and stage != "moving":
-            self._shaders.place(stage, self._middle, anchor)
+            self._spot.seen_from(anchor)
             self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
@@ -135,6 +135,7 @@ class WallBuffers:
             array.release()
         for buffer in self._buffers:
             buffer.release()
+        self._spot.release()
 
 
 def style_of(building: Building, street_map: StreetMap) -> WallStyle:

@@ -180,9 +180,13 @@ def _kept(rows: bytes, wanted: int) -> Floats:
     if wanted > len(table):
         return _between(table, wanted)
     kept = list(range(len(table)))
+    losses: dict[tuple[int, int, int], float] = {}
     while len(kept) > max(wanted, 2):
-        cost = [_loss(table, kept[i - 1], kept[i], kept[i + 1]) for i in range(1, len(kept) - 1)]
-        del kept[1 + int(np.argmin(cost))]
+        for ends in zip(kept, kept[1:], kept[2:], strict=False):
+            if ends not in losses:
+                losses[ends] = _loss(table, *ends)
+        cost = [losses[ends] for ends in zip(kept, kept[1:], kept[2:], strict=False)]
+        del kept[1 + cost.index(min(cost))]
     return _fitted(table, kept)
 
 
