@@ -22,6 +22,7 @@ Size = tuple[float, float, float]
 """Length along the street, depth across it, height, in metres."""
 
 METAL: Final = (0.24, 0.26, 0.28)
+ZINC: Final = (0.52, 0.53, 0.54)
 WOOD: Final = (0.52, 0.36, 0.22)
 STONE: Final = (0.62, 0.60, 0.57)
 BARK: Final = (0.36, 0.27, 0.20)
@@ -108,7 +109,7 @@ def sign(size: Size) -> tuple[Part, ...]:
     rim, face = disc(radius, (0.0, 0.0, 0.0), *shape), disc(0.86 * radius, (0.0, 0.0, 0.0), *shape)
     turn = [disc_.moved((0.0, 0.0, 0.0), math.pi) for disc_ in (rim, face)]
     return (
-        Part(join([pole, back.moved(middle)]), METAL, "metal-brushed"),
+        Part(join([pole, back.moved(middle)]), ZINC, "metal-brushed"),
         Part(turn[0].moved(middle), WHITE),
         Part(turn[1].moved((middle[0] - 0.006, middle[1], middle[2])), None),
     )
@@ -202,7 +203,7 @@ def shelter(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     roof = box((length + 0.2, depth + 0.1, 0.1), (0.0, 0.0, h))
     seat = box((length - 1.0, 0.35, 0.06), (0.0, 0.5 * depth - 0.3, 0.48), skip=("back", "front"))
-    panes = [box((length, 0.05, h - 0.3), (0.0, 0.5 * depth - 0.03, 0.5 * h + 0.05), skip=("top", "left", "right"))]
+    panes = [box((length, 0.05, h - 0.3), (0.0, 0.5 * depth - 0.03, 0.5 * h + 0.05), skip=("top", "front", "back"))]
     panes += [
         box((0.05, depth, h - 0.1), (s * 0.5 * (length - 0.05), 0.0, 0.5 * h - 0.05), skip=("top", "bottom"))
         for s in (-1, 1)
@@ -224,7 +225,7 @@ def fence(size: Size) -> tuple[Part, ...]:
     mesh = [box((length, 0.04, 0.62 * h), (0.0, 0.0, 0.6 * h))]
     feet = [box((0.25, depth, 0.12), (s * (0.5 * length - 0.3), 0.0, 0.06), skip=("bottom",)) for s in (-1, 1)]
     posts = [box((0.06, 0.06, h), (s * (0.5 * length - 0.3), 0.0, 0.5 * h), skip=("bottom", "top")) for s in (-1, 1)]
-    return Part(join(mesh), None), Part(join([*feet, *posts]), WHITE)
+    return Part(join(mesh), None, "wood-upright"), Part(join([*feet, *posts]), WHITE)
 
 
 def car(size: Size) -> tuple[Part, ...]:

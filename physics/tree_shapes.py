@@ -66,6 +66,7 @@ def crown(species: Species, height_m: float) -> Crown:
     rng = np.random.default_rng(zlib.crc32(f"{species}:{height_m:.3f}".encode()))
     rays, triangles = _globe()
     reach = _reach(rays, species, rng) * rng.uniform(0.91, 1.09, len(rays))
+    reach[[0, -1]] = 0.96 * reach[1 : 1 + _SIDES].mean(), 0.96 * reach[-1 - _SIDES : -1].mean()  # no tips at the poles
     at = rays * reach[:, None]
     widest = np.hypot(at[:, 0], at[:, 1]).max()
     bottom, top = at[:, 2].min(), at[:, 2].max()
