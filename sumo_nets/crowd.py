@@ -242,7 +242,11 @@ class SumoCrowd(Crowd):
 
 
 def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
-    """SUMO's command line. Without jam times nobody squeezes through the robot; see the options' own help for more."""
+    """SUMO's command line; see the options' own help for more.
+
+    Without jam times nobody squeezes through the robot. With route errors ignored, somebody who cannot walk on jumps to
+    the next edge of the walk: without, SUMO stops all persons for good.
+    """
     options: dict[str, object] = {
         "net-file": net_path,
         "seed": sumo_seed,
@@ -258,6 +262,7 @@ def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
         "time-to-teleport": -1,
         "max-depart-delay": 1,
         "lanechange.duration": 2,
+        "ignore-route-errors": "true",
         "no-step-log": "true",
         "no-warnings": "true",
     }

@@ -177,11 +177,21 @@ class Pedestrians:
             walk = self._graph.wander(self._rng, spot.edge, forward, WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
-            self._add(spot, walk, speed_mps, (x, y))
+            self._add(spot, self._one_way(walk, forward), speed_mps, (x, y))
             taken.append((x, y))
             count -= 1
             if count == 0:
                 return
+
+    def _one_way(self, walk: list[str], forward: bool) -> list[str]:
+        """A walk that SUMO takes in one direction only.
+
+        From one sidewalk onto another between the same junctions SUMO may set out in either direction, and dies where
+        the two do not meet: there the corner between them is named.
+        """
+        first, second = ({self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)} for e in walk[:2])
+        corner = self._graph.street_map.strips[walk[0]].corners[1 if forward else 0]
+        return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
     def _add(self, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
         """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""

@@ -328,6 +328,24 @@ def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
         assert crowd.street.tick == 2000
 
 
+def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:
+    """Behind a barrier they go back to the street's other sidewalk over the far end, where the two meet, and arrive."""
+    at_m = {"a": (0, 0), "b": (60, 0), "c": (66, 2)}
+    nodes, edges, net = (tmp_path / name for name in ("n.nod.xml", "e.edg.xml", "street.net.xml"))
+    nodes.write_text("<n>" + "".join(f'<node id="{k}" x="{x}" y="{y}"/>' for k, (x, y) in at_m.items()) + "</n>")
+    edge = '<edge id="{0}" from="{0[0]}" to="{0[1]}" numLanes="1" sidewalkWidth="1.92"/>'
+    edges.write_text("<e>" + "".join(edge.format(way) for way in ("ab", "ba", "bc", "cb")) + "</e>")
+    netconvert(["-n", str(nodes), "-e", str(edges), "--walkingareas"], net)
+    street_map = read_net(net)
+    barrier = frozenset({Port("bc", 1)})
+    assert WalkGraph(street_map).wander(np.random.default_rng(0), "ab", False, 9, barrier) == ["ab", "ba"]
+    with SumoCrowd(net, street_map, CrowdSpec(persons=12, vehicles=0), 9, barrier, (0.0, 0.0)) as crowd:
+        for tick in range(1600):
+            crowd.step(at(Pose(0.0, 20.0, 0.0)), reply(tick))
+            assert crowd.street.people.xy[:, 0].max(initial=0.0) < 57.0
+        assert int(crowd.street.people.ids[-1][1:]) > 20
+
+
 def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
     """A second crowd, a step without a running one, bad actors and a broken net each get their own message."""
     spec = CrowdSpec(persons=2, vehicles=0)
