@@ -107,7 +107,7 @@ def _of(strip: Strip, seed: int, houses: shapely.Geometry) -> list[tuple[Cover, 
     elif covers is not None:
         cover = covers[int(of_street.integers(len(covers)))]
         found.append((cover, _beside(line, edge - 0.05, edge + depth + _YARD_M)))
-    elif rng.random() < 0.6:
+    elif strip.street_class == "residential" and rng.random() < 0.6:  # on other maps there may be no house
         width = float(rng.uniform(*_BED_M))
         found.append((_BEDS, _beside(line, edge + depth - width, edge + depth + _UNDER_M)))
     way = _WAYS[int(of_street.integers(len(_WAYS)))]
