@@ -25,6 +25,7 @@ from rich.table import Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
+from cosim.cli_crowd import counterfactual
 from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
 from cosim.cli_live import checked_endpoint, inject, listen, replay
 from cosim.cli_map import map_app
@@ -44,6 +45,7 @@ app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n
     look
 )
 app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
+app.command(epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(counterfactual)
 app.command(epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`")(
     bench
 )

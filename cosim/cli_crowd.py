@@ -1,7 +1,11 @@
-"""The command line of street life: `cosim bench crowd`."""
+"""The command line of street life: `cosim bench crowd`, `cosim counterfactual`."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated
+
+import typer
 from rich.console import Console
 from rich.table import Table
 
@@ -54,3 +58,23 @@ def bench_crowd(cities: int, minutes: float) -> None:
             one.place, f"{one.minutes:.0f}", f"{one.persons:.0f}", f"{100 * overlaps:.4f} %", f"{one.crowd_ms:.2f}"
         )
     out.print(each)
+
+
+def counterfactual(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+) -> None:
+    """Replay an episode, simulate its street again without the robot, and print whom the robot delayed by how much."""
+    from cosim.delay import NEAR_M
+    from scenarios.counterfactual import counterfactual as compare
+    from scenarios.replay import check, recorded
+
+    with err.status(f"{episode}, with and without its robot ..."):
+        told = recorded(folder, episode)
+        found = compare(told)
+    check(folder, told, found.state_hash)
+    table = Table(episode, f"delay, s: within {NEAR_M:g} m", "of", "delay, s: all", "of", "not comparable")
+    for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
+        near, everybody = (f"{delay.near_s:+.1f}", str(delay.near)), (f"{delay.delay_s:+.1f}", str(delay.compared))
+        table.add_row(name, *near, *everybody, str(delay.unmatched))
+    out.print(table)

@@ -1,8 +1,8 @@
-"""Nobody walks through anybody: how shown people keep apart, and out of the poles on the sidewalk.
+"""Nobody walks through anybody: how shown people keep apart.
 
 SUMO's walkers change stripes through one another, and their paths over corners cross. A step that would bring two
-people nearer than KEEP_M is led aside: each gives way by half, an event pedestrian not at all. Where somebody meets
-somebody or something head-on, the step bends to the side on which it would pass; that choice strengthens itself.
+people nearer than KEEP_M is led aside: each gives way by half, an event pedestrian not at all. Where two meet head-on,
+the step bends to the side on which it would pass; that choice strengthens itself.
 """
 
 from __future__ import annotations
@@ -17,9 +17,6 @@ from cosim.geometry import Floats
 
 KEEP_M: Final = 0.45
 """Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
-
-THING_M: Final = 0.25
-"""Least distance of a person's middle from the outline of a thing."""
 
 NEAR_M: Final = 0.6
 """Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
@@ -38,33 +35,26 @@ Complex = NDArray[np.complex128]
 """Points of the plane, x + iy in metres: turning and measuring are single operations."""
 
 
-def kept_apart(before: Floats, wanted: Floats, firm: NDArray[np.bool_], things: Floats, reach_m: float) -> Floats:
+def kept_apart(before: Floats, wanted: Floats, firm: NDArray[np.bool_], reach_m: float) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
 
-    firm (N,): who does not give way. things (M, 3): x, y, radius of round things to keep out of, metres. reach_m: the
-    farthest that anybody goes in this step.
+    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step.
     """
     one, other = _pairs(wanted, firm)
-    person, thing = _beside(wanted, firm, things)
-    if not len(one) and not len(person):
+    if not len(one):
         return wanted
     start, goal = _points(before), _points(wanted)
-    at, middle = goal.copy(), _points(things[thing, :2])
+    at = goal.copy()
     share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
     share_other = np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
-    apart, off = start[other] - start[one], start[person] - middle
+    apart = start[other] - start[one]
     bend = _bend(apart, goal[other] - goal[one] - apart)
-    bend_off, keep_off = _bend(off, goal[person] - start[person]), things[thing, 2] + THING_M
     for k in range(ROUNDS):
         if k == BENDS:
-            bend, bend_off = np.ones_like(bend), np.ones_like(bend_off)
-        push, most_m = _push(at[other] - at[one], apart, KEEP_M, bend)
+            bend = np.ones_like(bend)
+        push, most_m = _push(at[other] - at[one], apart, bend)
         np.add.at(at, other, share_other * push)
         np.subtract.at(at, one, share_one * push)
-        if len(person):
-            push, most_off_m = _push(at[person] - middle, off, keep_off, bend_off)
-            np.add.at(at, person, push)
-            most_m = max(most_m, most_off_m)
         if most_m < ENOUGH_M:
             break
     step = at - start
@@ -91,15 +81,6 @@ def _pairs(xy: Floats, firm: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArr
     return (one[moves], other[moves]) if (close & moves).any() else (nobody, nobody)
 
 
-def _beside(xy: Floats, firm: NDArray[np.bool_], things: Floats) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of people and of the things that they are too near to."""
-    if not len(things):
-        return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
-    gap = np.abs(_points(xy)[:, None] - _points(things[:, :2])) - things[:, 2]
-    person, thing = np.nonzero((gap < THING_M) & ~firm[:, None])
-    return person, thing
-
-
 def _bend(apart: Complex, step: Complex) -> Complex:
     """(K,) by what a push is turned aside: to the side on which a step passes; not where the step leads away."""
     turned = apart.conj() * step
@@ -107,13 +88,13 @@ def _bend(apart: Complex, step: Complex) -> Complex:
     return np.where(turned.real < 0.0, 1.0 + 1j * BEND * side, 1.0 + 0j)
 
 
-def _push(apart: Complex, before: Complex, keep_m: float | Floats, bend: Complex) -> tuple[Complex, float]:
+def _push(apart: Complex, before: Complex, bend: Complex) -> tuple[Complex, float]:
     """(K,) how to move the second of each pair so that it keeps away, and the most that is lacking in metres.
 
     apart, before: (K,) from the first of each pair to the second, now and at the beginning of the step.
     """
     far = np.abs(apart)
-    lost = np.maximum(keep_m - far, 0.0)
+    lost = np.maximum(KEEP_M - far, 0.0)
     # Two at one place part along the line on which they came.
     line = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
     push: Complex = lost * line / np.abs(line) * bend

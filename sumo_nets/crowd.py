@@ -114,8 +114,11 @@ class SumoCrowd(Crowd):
             raise EngineError("this SumoCrowd is not running: use it as a context manager")
         return self._street
 
-    def step(self, robot: RobotState, reply: EventReply) -> Street:
-        """One tick on, with the robot and the event pedestrians where they are now."""
+    def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
+        """One tick on, with the robot and the event pedestrians where they are now.
+
+        absent: nobody is there where the robot would be; the crowd still comes and goes around that point.
+        """
         tick = self.street.tick
         with _translated(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
@@ -124,10 +127,11 @@ class SumoCrowd(Crowd):
                 persons, vehicles = self._seen
                 self._pedestrians.roll(x_m, y_m, persons, self._waits_at_red)
                 self._drivers.roll(x_m, y_m, vehicles)
-            self._robot.update(robot.pose)
+            if not absent:
+                self._robot.update(robot.pose)
             self._mirror(reply.actors)
             libsumo.simulationStep()
-            body = Body(robot.pose, self._half_m, robot.v_mps)
+            body = None if absent else Body(robot.pose, self._half_m, robot.v_mps)
             self._street = self._read(tick + 1, x_m, y_m, reply.actors, body)
         return self._street
 

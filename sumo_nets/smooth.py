@@ -2,7 +2,7 @@
 
 SUMO's striping model moves a person by up to metres in one step where strips and corners meet, and flips its angle
 on a sidestep. The shown person walks to where SUMO has it, no faster than a brisk walk, and turns like a body; on
-the way it keeps out of others, of things, and of the robot.
+the way it keeps out of others and of the robot.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ TURNING_SPEED_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
 
 NOBODY_ELSE: Floats = np.zeros((0, 2))
-NOTHING: Floats = np.zeros((0, 3))
 
 
 @dataclass(slots=True)
@@ -50,12 +49,11 @@ class PoseFilter:
         speed: Floats,
         body: Body | None = None,
         others: Floats = NOBODY_ELSE,
-        things: Floats = NOTHING,
     ) -> tuple[Floats, Floats, Floats]:
         """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
 
         Who is new is shown as simulated; who is missing is forgotten. body: the robot, round which people step.
-        others (K, 2) m: people who are moved by somebody else. things (M, 3): x, y, radius of what stands around.
+        others (K, 2) m: people who are moved by somebody else.
         """
         row = np.array([self._index.get(name, -1) for name in ids], dtype=np.intp)
         known = row >= 0
@@ -68,7 +66,7 @@ class PoseFilter:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
-        shown = self._apart(before, shown, others, things)
+        shown = self._apart(before, shown, others)
         if body is not None:
             shown = stepped_round(before, shown, body)
         velocity = np.where(known[:, None], (shown - before) / self.period_s, simulated)
@@ -84,7 +82,7 @@ class PoseFilter:
         self._index = {name: i for i, name in enumerate(ids)}
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
 
-    def _apart(self, before: Floats, shown: Floats, others: Floats, things: Floats) -> Floats:
+    def _apart(self, before: Floats, shown: Floats, others: Floats) -> Floats:
         firm = np.arange(len(shown) + len(others)) >= len(shown)
         before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return kept_apart(before, wanted, firm, things, MAX_SPEED_MPS * self.period_s)[: len(shown)]
+        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s)[: len(shown)]

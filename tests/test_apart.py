@@ -1,23 +1,22 @@
-"""Nobody walks through anybody, nor through a pole."""
+"""Nobody walks through anybody."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from sumo_nets.apart import KEEP_M, THING_M, kept_apart
+from sumo_nets.apart import KEEP_M, kept_apart
 
 REACH_M = 2.2 * 0.05
-NOTHING = np.zeros((0, 3))
 
 
-def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray, things: np.ndarray = NOTHING) -> list[np.ndarray]:
+def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
     """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps as it wants."""
     at, track = start.astype(float), []
     for _ in range(200):
         away = goal - at
         far = np.maximum(np.hypot(*away.T), 1e-9)[:, None]
-        at = kept_apart(at, at + away / far * np.minimum(far, 0.07), firm, things, REACH_M)
+        at = kept_apart(at, at + away / far * np.minimum(far, 0.07), firm, REACH_M)
         track.append(at)
     return track
 
@@ -42,14 +41,6 @@ def test_who_is_firm_does_not_give_way() -> None:
     assert max(abs(float(at[1, 1])) for at in track) > 0.8 * KEEP_M
 
 
-def test_people_walk_round_a_pole() -> None:
-    """A pole of 10 cm in the middle of the way is passed at an arm's length."""
-    pole = np.array([[0.0, 0.0, 0.05]])
-    track = walked(np.array([[-3.0, 0.0]]), np.array([[3.0, 0.0]]), np.array([False]), pole)
-    assert min(float(np.hypot(*at[0])) for at in track) > 0.9 * (0.05 + THING_M)
-    assert abs(float(track[-1][0, 0]) - 3.0) < 0.05
-
-
 def test_a_throng_at_one_place_parts() -> None:
     """Eight who all want to stand at the same place end up side by side, none in another."""
     rng = np.random.default_rng(1)
@@ -62,4 +53,4 @@ def test_who_is_alone_walks_as_it_wants() -> None:
     """Without anybody near the very same values come back."""
     before = np.array([[0.0, 0.0], [2.0, 0.0]])
     wanted = before + 0.07
-    assert kept_apart(before, wanted, np.zeros(2, dtype=bool), NOTHING, REACH_M) is wanted
+    assert kept_apart(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted

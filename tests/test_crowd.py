@@ -150,6 +150,16 @@ def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
     assert nearest >= 0.5
 
 
+def test_an_absent_robot_is_walked_through(place: Place) -> None:
+    """Where people keep half a metre from a robot, without it somebody walks over the very place."""
+    start = middle(place)
+    nearest = math.inf
+    with SumoCrowd(place.net, place.map, CrowdSpec(persons=60, radius_m=60.0, vehicles=0), 4, OPEN, start[:2]) as crowd:
+        for tick in range(2400):
+            nearest = min(nearest, float(gaps(crowd.step(at(start), reply(tick), absent=True), start).min()))
+    assert nearest < 0.4
+
+
 def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
     """In two minutes next to signals people wait and start over crossings, none once it has been red for 2 s.
 
