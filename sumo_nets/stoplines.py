@@ -39,8 +39,10 @@ class StopLines:
         self._red_s = {k: self._red_s.get(k, 0.0) + self._tick_s for k, letter in lit.items() if letter == "r"}
         found = []
         for name, (light, link, away_m) in self._next.items():
-            # A light farther than a tick's way that is gone was turned away from, not passed.
-            if name in vehicles and away_m < 3.0 and ahead.get(name, ("", -1))[:2] != (light, link):
+            # A light farther than a tick's way that is gone was turned away from; one that stays at hand is another
+            # lane's of the same junction: the vehicle has changed lanes at the stop line.
+            next_light, _, next_m = ahead.get(name, ("", -1, 0.0))
+            if name in vehicles and away_m < 3.0 and (next_light != light or next_m > away_m + 3.0):
                 found.append(Passed(name, lit[light, link], self._red_s.get((light, link), 0.0)))
         self._next = ahead
         return found

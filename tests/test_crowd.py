@@ -20,6 +20,7 @@ from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.netfile import netconvert, read_net
+from sumo_nets.stoplines import StopLines
 from sumo_nets.store import build_city
 
 pytestmark = pytest.mark.engine
@@ -188,6 +189,17 @@ def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
             on = now
     assert len(entries) >= 10 and waiting > 100
     assert max(entries) < 2.0
+
+
+def test_vehicles_stop_at_red(place: Place) -> None:
+    """In two minutes vehicles pass stop lines, none of them at red."""
+    start = middle(place, signalised=True)
+    lights = ""
+    with SumoCrowd(place.net, place.map, CrowdSpec(persons=0, vehicles=30), 6, OPEN, start[:2]) as crowd:
+        lines = StopLines(0.05)
+        for tick in range(2400):
+            lights += "".join(p.light for p in lines.passed(crowd.step(at(start), reply(tick)).vehicles.ids))
+    assert len(lights) >= 10 and "r" not in lights
 
 
 def test_signals_change_when_they_say(place: Place) -> None:
