@@ -29,6 +29,7 @@ from scenarios.behaviors import BEHAVIORS, react
 from scenarios.build import Proof
 from scenarios.catalog import SUITES, chosen, suite
 from scenarios.long_horizon import build, on_road_m
+from scenarios.sample import suite_on_map, thinned
 from sumo_nets.mapstore import read_map
 
 LONG = suite("long-horizon").scenarios
@@ -125,6 +126,15 @@ def test_roughness_can_be_asked_for_on_a_map_alone() -> None:
 
 
 @pytest.mark.engine
+def test_fewer_people_walk_where_sidewalks_are_few() -> None:
+    """On a small map there are fewer people than in a city, and no more than were asked for where there is room."""
+    (scenario,) = suite_on_map("long-horizon", "sumo-fkk-in", 1, 1).scenarios
+    assert 20 <= scenario.crowd.persons <= 40
+    ten = msgspec.structs.replace(scenario.crowd, persons=10)
+    few = msgspec.structs.replace(scenario, crowd=ten)
+    assert thinned(few, read_map("sumo-fkk-in")) == few
+
+
 def test_free_space_ends_at_furniture() -> None:
     """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
     from physics.furniture import Prop, footprints
