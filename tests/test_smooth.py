@@ -73,8 +73,9 @@ def test_people_come_and_go() -> None:
     poses = PoseFilter(DT_S)
     ab = np.array([[0.0, 0.0], [10.0, 0.0]])
     poses.update(("a", "b"), ab, np.zeros(2), np.zeros(2))
-    xy, _, _ = poses.update(("b", "c"), ab, np.zeros(2), np.zeros(2))
-    assert xy[0] == pytest.approx([10.0 - MAX_SPEED_MPS * DT_S, 0.0]) and xy[1] == pytest.approx(ab[1])
+    bc = np.array([[0.0, 0.0], [20.0, 0.0]])
+    xy, _, _ = poses.update(("b", "c"), bc, np.zeros(2), np.zeros(2))
+    assert xy[0] == pytest.approx([10.0 - MAX_SPEED_MPS * DT_S, 0.0]) and xy[1] == pytest.approx(bc[1])
     empty = poses.update((), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
     assert [len(part) for part in empty] == [0, 0, 0]
     xy, _, _ = poses.update(("b",), ab[:1], np.zeros(1), np.zeros(1))
