@@ -272,7 +272,7 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, who
     """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid choices."""
     asked = {
         ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
-        ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "route, stop, straight"),
+        ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "route, social_force, stop, straight"),
         ("run", "tiny.json", "--policy", "mine:Nam"): ("'Nam'", "Nan"),
         ("run", "tiny.json", "--policy", "nowhere:X"): ("module 'nowhere' cannot be imported", "ModuleNotFoundError"),
         ("run", "tiny.json", "--policy", "mine:Unfinished"): ("'mine:Unfinished' has no attribute 'manifest'", ""),
