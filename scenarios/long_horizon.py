@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from cosim.errors import CosimError, MapError, SpecError
+from cosim.errors import MapError, SpecError
 from cosim.events import Event, Kind
 from cosim.geometry import Polyline
 from cosim.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
@@ -17,6 +17,7 @@ from cosim.streetmap import Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
 from scenarios.barriers import barrier_at, branches, prove_single_path
+from scenarios.drawing import first_that_fits
 
 SHORTEST_M = 120.0
 LONGEST_M = 560.0
@@ -35,7 +36,6 @@ EVENT_WALKWAY_M = 3.0
 
 EVENT_STRAIGHT_M = 24.0
 EVENT_BEND_M = 0.4
-TRIES = 400
 
 
 def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
@@ -49,15 +49,10 @@ def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scen
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")
-    refusals: dict[str, int] = {}
-    for _ in range(TRIES):
-        try:
-            return _draw(place, street_map, graph, rng, candidates, seed, scenario_id)
-        except CosimError as refusal:
-            reason = str(refusal).split(":")[0]
-            refusals[reason] = refusals.get(reason, 0) + 1
-    told = "; ".join(f"{reason} ({n} times)" for reason, n in sorted(refusals.items(), key=lambda r: -r[1]))
-    raise SpecError(f"no long-horizon route on '{street_map.name}' with seed {seed} in {TRIES} draws: {told}")
+    return first_that_fits(
+        lambda: _draw(place, street_map, graph, rng, candidates, seed, scenario_id),
+        f"no long-horizon route on '{street_map.name}' with seed {seed}",
+    )
 
 
 def _draw(

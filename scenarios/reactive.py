@@ -12,15 +12,15 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString
 
-from cosim.errors import CosimError, MapError, SpecError
+from cosim.errors import MapError, SpecError
 from cosim.events import GROUPS, Event, Kind
 from cosim.geometry import Floats, Polyline
 from cosim.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Port, StreetMap, Strip
 from cosim.walks import WalkGraph
+from scenarios.drawing import first_that_fits
 from scenarios.long_horizon import route_crossings
 
-TRIES = 400
 LIMIT_S = 60.0
 CROWD = CrowdSpec(persons=12, radius_m=80.0, vehicles=8)
 BESIDE_CROSSING_M = (2.0, 5.0)
@@ -71,18 +71,14 @@ def build(kind: Kind, place: Place, street_map: StreetMap, graph: WalkGraph, see
     strips = [street_map.strips[s] for s in even if street_map.strips[s].kind == wanted]
     if not strips:
         raise MapError(f"map '{street_map.name}' has no {wanted} for '{kind}'")
-    refusals: dict[str, int] = {}
-    for _ in range(TRIES):
+
+    def draw() -> Scenario:
         strip = strips[int(rng.integers(len(strips)))]
-        try:
-            if kind == "ped_crossing":
-                return _over_crossing(place, street_map, strip, rng, seed, scenario_id)
-            return _along_sidewalk(kind, place, street_map, strip, rng, seed, scenario_id)
-        except CosimError as refusal:
-            reason = str(refusal).split(":")[0]
-            refusals[reason] = refusals.get(reason, 0) + 1
-    told = "; ".join(f"{reason} ({n} times)" for reason, n in sorted(refusals.items(), key=lambda r: -r[1]))
-    raise SpecError(f"no place for '{kind}' on '{street_map.name}' with seed {seed} in {TRIES} draws: {told}")
+        if kind == "ped_crossing":
+            return _over_crossing(place, street_map, strip, rng, seed, scenario_id)
+        return _along_sidewalk(kind, place, street_map, strip, rng, seed, scenario_id)
+
+    return first_that_fits(draw, f"no place for '{kind}' on '{street_map.name}' with seed {seed}")
 
 
 def _along_sidewalk(
