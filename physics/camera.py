@@ -9,19 +9,18 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from types import TracebackType
 from typing import Final, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from cosim.errors import EngineError
 from cosim.ports import CameraSpec
 from cosim.state import LABELS, Frame, RobotState, Street
 from physics.canvas import Canvas
-from physics.lens import drawn, through
+from physics.eyes import WorldCamera
 from physics.scene import Scene
-from physics.view import FAR_M, NEAR_M, Shot, check_size, robot_shot, shot
+from physics.view import FAR_M, NEAR_M, Shot
 from physics.world import BulletWorld
 
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
@@ -32,14 +31,12 @@ _CLEAR_M: Final = 20.0
 _HAZE_M: Final = 110.0
 
 
-class BulletCamera:
+class BulletCamera(WorldCamera):
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False) -> None:
-        check_size(spec.width, spec.height, spec.fov_deg)
-        self.spec, self._pinhole = spec, drawn(spec)
-        self._world = world
-        self._depth, self._egl = depth, egl
+        super().__init__(world, spec, depth)
+        self._egl = egl
         self._canvas: Canvas | None = None
         self._scene: Scene | None = None
 
@@ -49,43 +46,20 @@ class BulletCamera:
             self._scene = Scene(self._canvas, self._world.ground, self._world.barriers, self._world.model)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """End the renderer; a second call does nothing."""
         if self._canvas is not None:
             self._canvas.close()
             self._canvas = self._scene = None
 
-    def render(self, robot: RobotState, street: Street) -> Frame:
-        """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
-        the picture."""
-        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
-        return through(self.spec, self._drawn(taken, street, None), robot, self._world.ground.seed, street.tick)
-
-    def picture(
-        self,
-        eye_m: ArrayLike,
-        target_m: ArrayLike,
-        street: Street,
-        robot: RobotState | None = None,
-        size: tuple[int, int] = (640, 480),
-        fov_deg: float = 60.0,
-    ) -> Frame:
-        """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
-        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot)
-
-    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None) -> Frame:
+    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
         if self._scene is not None and self._scene.built > _TILES_MAX:
             self.close()
             self.__enter__()
         if self._canvas is None or self._scene is None:
             raise EngineError("the camera is not running: use BulletCamera in a 'with' block")
         self._scene.arrange(taken.view, street)
-        if robot is not None:
+        if robot is not None and body:
             _, roll, pitch = self._world.ground.lean(robot.pose, self._world.model)
             self._scene.show_robot(robot.pose, robot.z_m, roll, pitch)
         rgb, labels, depth = self._canvas.draw(taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_M, FAR_M)

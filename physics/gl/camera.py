@@ -7,18 +7,17 @@ whatever was drawn before.
 from __future__ import annotations
 
 import math
-from types import TracebackType
 from typing import Final, Self
 
 import moderngl
 import numpy as np
-from numpy.typing import ArrayLike
 
 from cosim.errors import EngineError
 from cosim.geometry import Floats
 from cosim.ports import CameraSpec
 from cosim.scenario import Light
 from cosim.state import Frame, RobotState, Street
+from physics.eyes import WorldCamera
 from physics.gl.backdrop import Backdrop
 from physics.gl.context import context
 from physics.gl.lighting import Lighting, lighting_of
@@ -26,9 +25,8 @@ from physics.gl.scene import Scene
 from physics.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.gl.shadows import ShadowMaps, middle_of
 from physics.gl.targets import Target
-from physics.lens import drawn, through
 from physics.sky import sky_of
-from physics.view import Shot, View, check_size, robot_shot, shot
+from physics.view import Shot, View
 from physics.world import BulletWorld
 
 NOON: Final = Light()
@@ -37,13 +35,12 @@ _TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0,
 """From clip space to the space of a texture."""
 
 
-class GlCamera:
+class GlCamera(WorldCamera):
     """The robot's camera in a world. Use it in a `with` block; the world need not be running."""
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
-        check_size(spec.width, spec.height, spec.fov_deg)
-        self.spec, self._pinhole = spec, drawn(spec)
-        self._world, self._depth, self._sky = world, depth, sky_of(light, world.ground.seed)
+        super().__init__(world, spec, depth)
+        self._sky = sky_of(light, world.ground.seed)
         self._light = lighting_of(self._sky)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
@@ -62,11 +59,6 @@ class GlCamera:
             self._context = gl
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
-
     def close(self) -> None:
         """Free what the camera holds; a second call does nothing."""
         if self._context is not None:
@@ -81,24 +73,6 @@ class GlCamera:
                     self._targets.popitem()[1].release()
             self._context = self._from_sun = None
 
-    def render(self, robot: RobotState, street: Street) -> Frame:
-        """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
-        the picture."""
-        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
-        return self.through_lens(self._drawn(taken, street, robot, body=False), robot, street)
-
-    def picture(
-        self,
-        eye_m: ArrayLike,
-        target_m: ArrayLike,
-        street: Street,
-        robot: RobotState | None = None,
-        size: tuple[int, int] = (640, 480),
-        fov_deg: float = 60.0,
-    ) -> Frame:
-        """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
-        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot, body=True)
-
     def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
@@ -110,14 +84,8 @@ class GlCamera:
             return Frame(rgb, labels, target.read_depth() if self._depth else None)
 
     def draw_into(self, target: Target, robot: RobotState, street: Street) -> None:
-        """Draw what `render` shows, but for the lens, into a target that was cleared. The
-        context must be held."""
-        taken = robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
-        self._draw(target, taken, street, robot, body=False)
-
-    def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
-        """What the lens makes of a picture that was drawn by `draw_into`."""
-        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
+        """Draw what `render` shows, but for the lens, into a target that was cleared. The context must be held."""
+        self._draw(target, self._mounted(robot), street, robot, body=False)
 
     def _draw(self, target: Target, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> None:
         gl = self._context
