@@ -17,6 +17,9 @@ from cosim.geometry import Floats
 
 EPS = 1e-9
 
+Vector = Floats | tuple[float, float]
+"""Two numbers: metres, or metres per second."""
+
 
 class HalfPlane(NamedTuple):
     """Velocities v (m/s) with normal . v >= offset. normal: of length 1, into the permitted side."""
@@ -31,7 +34,7 @@ class HalfPlane(NamedTuple):
 
 
 def half_plane(
-    apart_m: Floats, mine_mps: Floats, other_mps: Floats, radius_m: float, horizon_s: float, share: float, step_s: float
+    apart_m: Vector, mine_mps: Vector, other_mps: Vector, radius_m: float, horizon_s: float, share: float, step_s: float
 ) -> HalfPlane:
     """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the paper.
 
@@ -43,27 +46,28 @@ def half_plane(
     `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs that touch it. u is the
     smallest change of the relative velocity that reaches the obstacle's boundary, n its outward normal there.
     """
-    relative = mine_mps - other_mps
-    distance_m = math.hypot(*apart_m)
+    ax, ay = float(apart_m[0]), float(apart_m[1])
+    mx, my = float(mine_mps[0]), float(mine_mps[1])
+    rx, ry = mx - float(other_mps[0]), my - float(other_mps[1])
+    distance_m = math.hypot(ax, ay)
     if distance_m <= radius_m:
         horizon_s = step_s
-    from_disk = relative - apart_m / horizon_s
-    along = float(from_disk @ apart_m)
-    before_disk = along < 0.0 and along**2 >= radius_m**2 * float(from_disk @ from_disk)
+    wx, wy = rx - ax / horizon_s, ry - ay / horizon_s
+    along = wx * ax + wy * ay
+    before_disk = along < 0.0 and along**2 >= radius_m**2 * (wx * wx + wy * wy)
     if distance_m <= radius_m or before_disk:
-        size = math.hypot(*from_disk)
-        normal = from_disk / size if size > EPS else -apart_m / max(distance_m, EPS)
-        inside = radius_m / horizon_s - float(from_disk @ normal)
+        size = math.hypot(wx, wy)
+        far_m = max(distance_m, EPS)
+        nx, ny = (wx / size, wy / size) if size > EPS else (-ax / far_m, -ay / far_m)
+        inside = radius_m / horizon_s - (wx * nx + wy * ny)
     else:
-        left = float(apart_m[0] * relative[1] - apart_m[1] * relative[0]) >= 0.0
         sin = radius_m / distance_m
         cos = math.sqrt(1.0 - sin**2)
-        ahead = apart_m / distance_m
-        aside = np.array([-ahead[1], ahead[0]]) if left else np.array([ahead[1], -ahead[0]])
-        normal = cos * aside - sin * ahead
-        inside = -float(relative @ normal)
-    at = mine_mps + share * inside * normal
-    return HalfPlane(float(normal[0]), float(normal[1]), float(at @ normal))
+        left = 1.0 if ax * ry - ay * rx >= 0.0 else -1.0
+        nx = (-left * cos * ay - sin * ax) / distance_m
+        ny = (left * cos * ax - sin * ay) / distance_m
+        inside = -(rx * nx + ry * ny)
+    return HalfPlane(nx, ny, (mx + share * inside * nx) * nx + (my + share * inside * ny) * ny)
 
 
 def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mps: float) -> Floats:
