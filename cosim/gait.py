@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.geometry import Floats
+from cosim.rows import Rows
 
 REFERENCE_M: Final = 1.75
 """Stature of the person whose strides are listed."""
@@ -77,28 +78,24 @@ class Strides:
     """Counts everybody's strides. period_s: time between two updates."""
 
     period_s: float
-    _index: dict[str, int] = field(default_factory=dict)
-    _table: Floats = field(default_factory=lambda: np.zeros((1, 4)))
+    _rows: Rows = field(default_factory=Rows)
+    _table: Floats = field(default_factory=lambda: np.zeros((1, 5)))
 
     def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats) -> tuple[Floats, Floats]:
         """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their speeds (N,).
 
         Who is new begins somewhere in a stride, drawn from the name, at the pace of the moment.
         """
-        row = np.array([self._index.get(name, -1) for name in ids], dtype=np.intp)
-        known = row >= 0
-        stature = np.array([stature_m(name) for name in ids])
+        row, known = self._rows.of(ids)
         before = self._table[row]
-        began = np.array([0.0 if old else first_stride(n) for n, old in zip(ids, known.tolist(), strict=True)])
-        pace = before[:, 3] + (speed - before[:, 3]) * min(self.period_s / SETTLE_S, 1.0)
-        pace = np.where(known, pace, speed)
-        moved = np.hypot(xy[:, 0] - before[:, 0], xy[:, 1] - before[:, 1])
-        moved = np.where(known & (moved < _JUMP_M), moved, 0.0)
-        strides = np.where(known, before[:, 2], began)
-        strides = strides + (moved / stride_m(pace, stature) if ids else 0.0)
+        for i in np.flatnonzero(~known).tolist():
+            before[i] = (*xy[i], first_stride(ids[i]), speed[i], stature_m(ids[i]))
+        at, strides, pace, stature = before[:, :2], before[:, 2], before[:, 3], before[:, 4]
+        pace = pace + (speed - pace) * min(self.period_s / SETTLE_S, 1.0)
+        moved = np.hypot(xy[:, 0] - at[:, 0], xy[:, 1] - at[:, 1])
         if ids:
-            self._table = np.column_stack([xy, strides, pace])
-        self._index = {name: i for i, name in enumerate(ids)}
+            strides = strides + np.where(moved < _JUMP_M, moved, 0.0) / stride_m(pace, stature)
+            self._table = np.column_stack([xy, strides, pace, stature])
         return strides, pace
 
 

@@ -31,14 +31,20 @@ BENDS: Final = 2
 BEND: Final = 0.6
 """Way to the side, as a share of the way back, where two walk at each other."""
 
+STIRS_M: Final = 0.002
+"""Nobody who stands moves in order to get nearer by less."""
+
 Complex = NDArray[np.complex128]
 """Points of the plane, x + iy in metres: turning and measuring are single operations."""
 
 
-def kept_apart(before: Floats, wanted: Floats, firm: NDArray[np.bool_], reach_m: float) -> Floats:
+def kept_apart(
+    before: Floats, wanted: Floats, firm: NDArray[np.bool_], reach_m: float, stand: NDArray[np.bool_] | None = None
+) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
 
-    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step.
+    firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step. stand (N,): who wants to
+    stand, and stays where it is rather than go somewhere that is no nearer to where it wants to stand.
     """
     one, other = _pairs(wanted, firm)
     if not len(one):
@@ -59,7 +65,18 @@ def kept_apart(before: Floats, wanted: Floats, firm: NDArray[np.bool_], reach_m:
             break
     step = at - start
     at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
+    if stand is not None and stand.any():
+        nowhere = np.abs(goal - at) > np.abs(goal - start) - STIRS_M
+        at = _settled(at, np.where(stand & nowhere, start, at), one, other)
     return np.column_stack([at.real, at.imag])
+
+
+def _settled(at: Complex, rather: Complex, one: NDArray[np.intp], other: NDArray[np.intp]) -> Complex:
+    """`rather` for those who are in nobody's way there, `at` for the others."""
+    crowded = np.abs(rather[other] - rather[one]) < KEEP_M - ENOUGH_M
+    gives_way = np.zeros(len(at), dtype=bool)
+    gives_way[one[crowded]] = gives_way[other[crowded]] = True
+    return np.where(gives_way, at, rather)
 
 
 def _points(xy: Floats) -> Complex:

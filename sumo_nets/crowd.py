@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from itertools import count
 from pathlib import Path
@@ -22,7 +22,7 @@ import numpy as np
 from cosim.errors import EngineError
 from cosim.events import Actor, EventReply
 from cosim.gait import Strides
-from cosim.geometry import Pose, headings_from_sumo
+from cosim.geometry import Floats, Pose, headings_from_sumo
 from cosim.giveway import Body
 from cosim.ports import Crowd
 from cosim.scenario import CrowdSpec
@@ -47,9 +47,12 @@ SIGNAL_CLOCK_S = 3600
 """The signals' clocks start somewhere in this span, drawn from the seed."""
 
 STANDING_MPS = 0.1
+NOWHERE_M = -1e8
+"""Who has not set out yet is beyond this."""
+
 EYE = "robot"
-Row = tuple[float, float, float, float, float]
-"""x m, y m, angle in SUMO's degrees, speed m/s, waiting s."""
+Row = dict[int, Any]
+"""Somebody's variables of one tick, as SUMO numbers them."""
 
 tc = libsumo.constants
 SUMO_ERRORS = (libsumo.TraCIException, libsumo.FatalTraCIError)
@@ -124,9 +127,9 @@ class SumoCrowd(Crowd):
             x_m, y_m = robot.pose[:2]
             libsumo.poi.setPosition(EYE, x_m, y_m)
             if tick % ROLL_TICKS == 0:
-                persons, vehicles = self._seen
-                self._pedestrians.roll(x_m, y_m, persons, self._waits_at_red)
-                self._drivers.roll(x_m, y_m, vehicles)
+                persons, vehicles = self._found
+                self._pedestrians.roll(x_m, y_m, _seen(libsumo.person, persons), self._waits_at_red)
+                self._drivers.roll(x_m, y_m, _seen(libsumo.vehicle, vehicles))
             if not absent:
                 self._robot.update(robot.pose)
             self._mirror(reply.actors)
@@ -177,12 +180,11 @@ class SumoCrowd(Crowd):
     def _watch(self, x_m: float, y_m: float) -> None:
         """One subscription each to the persons and to the vehicles around a point that follows the robot."""
         libsumo.poi.add(EYE, x_m, y_m, (0, 0, 0, 0))
-        variables = [tc.VAR_POSITION, tc.VAR_ANGLE, tc.VAR_SPEED, tc.VAR_WAITING_TIME]
-        for domain, reach_m, further in (
-            (tc.CMD_GET_PERSON_VARIABLE, self._spec.radius_m + LINGER_M, [tc.VAR_NEXT_EDGE]),
-            (tc.CMD_GET_VEHICLE_VARIABLE, VEHICLE_REACH_M, []),
+        for domain, reach_m, variables in (
+            (tc.CMD_GET_PERSON_VARIABLE, self._spec.radius_m + LINGER_M, (tc.VAR_SPEED, tc.VAR_NEXT_EDGE)),
+            (tc.CMD_GET_VEHICLE_VARIABLE, VEHICLE_REACH_M, (tc.VAR_SPEED, tc.VAR_ANGLE)),
         ):
-            libsumo.poi.subscribeContext(EYE, domain, reach_m, variables + further)
+            libsumo.poi.subscribeContext(EYE, domain, reach_m, [tc.VAR_POSITION, *variables])
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
@@ -196,31 +198,22 @@ class SumoCrowd(Crowd):
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: Body | None) -> Street:
-        persons: dict[str, Row] = {}
-        vehicles: dict[str, Row] = {}
-        waits: dict[str, str] = {}
-        found: dict[str, Any] = libsumo.poi.getContextSubscriptionResults(EYE)
-        for name in sorted(found):
-            kind = vehicles if name[0] == "v" else persons if name[0] == "c" else None
-            values = found[name]
-            if kind is not None and (xy := values[tc.VAR_POSITION])[0] > -1e8:
-                kind[name] = (*xy, values[tc.VAR_ANGLE], values[tc.VAR_SPEED], values[tc.VAR_WAITING_TIME])
-                if kind is persons and self._signals.is_red(ahead := values[tc.VAR_NEXT_EDGE]):
-                    waits[name] = ahead
-        self._seen = tuple({i: Seen(v[0], v[1], v[4]) for i, v in kind.items()} for kind in (persons, vehicles))
-        for name, crossing in waits.items():
-            row = persons[name]
-            persons[name] = (*self._kerbs.behind(crossing, row[0], row[1]), *row[2:])
+        found: dict[str, Row] = libsumo.poi.getContextSubscriptionResults(EYE)
+        here = sorted(name for name, row in found.items() if row[tc.VAR_POSITION][0] > NOWHERE_M)
+        persons, vehicles = ({name: found[name] for name in here if name[0] == kind} for kind in "cv")
+        self._found = persons, vehicles
         people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
     def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...], body: Body | None) -> People:
         ids = tuple(persons)
-        table = np.array(list(persons.values()), dtype=float).reshape(-1, 5)
+        xy, speed = _column(persons, tc.VAR_POSITION, 2), _column(persons, tc.VAR_SPEED)
+        for i, row in enumerate(persons.values()):
+            if self._signals.is_red(ahead := row[tc.VAR_NEXT_EDGE]):
+                xy[i] = self._kerbs.behind(ahead, *row[tc.VAR_POSITION])
         cast = sorted(actors, key=lambda actor: actor.id)
         others = np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)
-        headings = headings_from_sumo(table[:, 2])
-        xy, heading, speed = self._poses.update(ids, table[:, :2], headings, table[:, 3], body, others)
+        xy, heading, speed = self._poses.update(ids, xy, speed, _facing, body, others)
         names = (*ids, *(a.id for a in cast))
         places = np.concatenate([xy, others])
         speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
@@ -229,20 +222,35 @@ class SumoCrowd(Crowd):
             places,
             np.concatenate([heading, [a.heading_rad for a in cast]]),
             speeds,
-            (*("walk" if fast else "stand" for fast in speed > STANDING_MPS), *(a.doing for a in cast)),
+            (*("walk" if fast else "stand" for fast in (speed > STANDING_MPS).tolist()), *(a.doing for a in cast)),
             *self._strides.update(names, places, speeds),
         )
 
     def _vehicles(self, vehicles: dict[str, Row]) -> Vehicles:
         """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""
-        table = np.array(list(vehicles.values()), dtype=float).reshape(-1, 5)
         size = np.array([self._drivers.size_m(name) for name in vehicles], dtype=float).reshape(-1, 2)
-        heading = headings_from_sumo(table[:, 2])
+        heading = headings_from_sumo(_column(vehicles, tc.VAR_ANGLE))
         back = 0.5 * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
-        return Vehicles.of(tuple(vehicles), table[:, :2] - back, heading, table[:, 3], size)
+        xy = _column(vehicles, tc.VAR_POSITION, 2) - back
+        return Vehicles.of(tuple(vehicles), xy, heading, _column(vehicles, tc.VAR_SPEED), size)
 
     def _waits_at_red(self, person: str) -> bool:
         return self._signals.is_red(libsumo.person.getNextEdge(person))
+
+
+def _seen(domain: Any, found: Mapping[str, Row]) -> dict[str, Seen]:
+    at = {name: row[tc.VAR_POSITION] for name, row in found.items()}
+    return {name: Seen(x_m, y_m, domain.getWaitingTime(name)) for name, (x_m, y_m) in at.items()}
+
+
+def _facing(person: str) -> float:
+    return float(headings_from_sumo(libsumo.person.getAngle(person)))
+
+
+def _column(found: Mapping[str, Row], variable: int, width: int | None = None) -> Floats:
+    """One variable of everybody: (N,), or (N, width)."""
+    values = np.array([row[variable] for row in found.values()], dtype=float)
+    return values if width is None else values.reshape(-1, width)
 
 
 def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:

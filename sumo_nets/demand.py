@@ -27,7 +27,10 @@ SIGHT_M = 35.0
 CLEAR_M = 8.0
 """In the first fill, when nobody watches yet, nobody appears nearer than this."""
 
-LINGER_M = 40.0
+ENTER_M = 40.0
+"""People enter in the outer part of the crowd's radius, so wide."""
+
+LINGER_M = 20.0
 """How far beyond the crowd's radius a person may stray before it is taken out."""
 
 STUCK_S = 60.0
@@ -151,7 +154,7 @@ class Pedestrians:
                 person.remove(name)
         away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]
-        low_m = min(max(SIGHT_M, radius_m - LINGER_M), radius_m - 10.0)
+        low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
         missing = self.wanted(x_m, y_m) - len(inside)
         if not isinstance(self._spec.density, msgspec.UnsetType):
             far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))

@@ -8,12 +8,15 @@ the way it keeps out of others and of the robot.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.geometry import Floats, wrap_angles
 from cosim.giveway import Body, stepped_round
+from cosim.rows import Rows
 from sumo_nets.apart import kept_apart
 
 MAX_SPEED_MPS = 2.2
@@ -28,6 +31,9 @@ LOOK_AHEAD_S = 0.3
 TURNING_SPEED_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
 
+STANDING_MPS = 0.1
+"""Below this SUMO's person stands."""
+
 NOBODY_ELSE: Floats = np.zeros((0, 2))
 
 
@@ -36,7 +42,7 @@ class PoseFilter:
     """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on."""
 
     period_s: float
-    _index: dict[str, int] = field(default_factory=dict)
+    _rows: Rows = field(default_factory=Rows)
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
@@ -45,31 +51,34 @@ class PoseFilter:
         self,
         ids: tuple[str, ...],
         xy: Floats,
-        heading: Floats,
         speed: Floats,
+        facing_of: Callable[[str], float],
         body: Body | None = None,
         others: Floats = NOBODY_ELSE,
     ) -> tuple[Floats, Floats, Floats]:
         """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
 
-        Who is new is shown as simulated; who is missing is forgotten. body: the robot, round which people step.
-        others (K, 2) m: people who are moved by somebody else.
+        Who is new is shown as simulated, facing as `facing_of` says; who is missing is forgotten. body: the robot,
+        round which people step. others (K, 2) m: people who are moved by somebody else.
         """
-        row = np.array([self._index.get(name, -1) for name in ids], dtype=np.intp)
-        known = row >= 0
-        simulated = speed[:, None] * np.column_stack([np.cos(heading), np.sin(heading)])
-        before = np.where(known[:, None], self._xy[row], xy)
-        facing = np.where(known, self._heading[row], heading)
-        motion = np.where(known[:, None], self._motion[row], simulated)
+        row, known = self._rows.of(ids)
+        before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
+        new = np.flatnonzero(~known)
+        if len(new):
+            before[new] = xy[new]
+            facing[new] = [facing_of(ids[i]) for i in new.tolist()]
+            motion[new] = speed[new, None] * np.column_stack([np.cos(facing[new]), np.sin(facing[new])])
+        simulated = motion[new]
 
         gap = xy - before
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
-        shown = self._apart(before, shown, others)
+        shown = self._apart(before, shown, others, speed < STANDING_MPS)
         if body is not None:
             shown = stepped_round(before, shown, body)
-        velocity = np.where(known[:, None], (shown - before) / self.period_s, simulated)
+        velocity = (shown - before) / self.period_s
+        velocity[new] = simulated
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
 
         moving = np.hypot(motion[:, 0], motion[:, 1]) > TURNING_SPEED_MPS
@@ -79,10 +88,10 @@ class PoseFilter:
 
         if ids:
             self._xy, self._heading, self._motion = shown, facing, motion
-        self._index = {name: i for i, name in enumerate(ids)}
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
 
-    def _apart(self, before: Floats, shown: Floats, others: Floats) -> Floats:
+    def _apart(self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]) -> Floats:
         firm = np.arange(len(shown) + len(others)) >= len(shown)
+        stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
         before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s)[: len(shown)]
+        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand)[: len(shown)]

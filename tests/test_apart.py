@@ -54,3 +54,30 @@ def test_who_is_alone_walks_as_it_wants() -> None:
     before = np.array([[0.0, 0.0], [2.0, 0.0]])
     wanted = before + 0.07
     assert kept_apart(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted
+
+
+def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
+    """Somebody that SUMO has stopped among three talkers comes as near as shoulders allow, and then does not stir."""
+    angles = np.pi / 2 + 2.0 * np.pi * np.arange(3) / 3
+    talkers = 0.62 * np.column_stack([np.cos(angles), np.sin(angles)])
+    start = np.vstack([talkers, [[0.2, 0.38]]])
+    goal = np.vstack([talkers, [[0.33, 0.36]]])
+    firm, stand = np.array([True, True, True, False]), np.array([False, False, False, True])
+    at, steps = start, []
+    for _ in range(100):
+        to = kept_apart(at, goal, firm, REACH_M, stand)
+        steps.append(float(np.hypot(*(to[3] - at[3]))))
+        at = to
+    assert np.hypot(*(at[:3] - at[3]).T).min() > 0.9 * KEEP_M
+    assert max(steps[40:]) == 0.0
+
+
+def test_who_stands_gives_way_to_who_comes_through() -> None:
+    """Standing is a wish, too: a walker is not held up by somebody that could step aside."""
+    at = np.array([[-2.0, 0.0], [0.0, 0.0]])
+    for _ in range(100):
+        wanted = np.array([at[0] + (0.07, 0.0), [0.0, 0.0]])
+        at = kept_apart(at, wanted, np.array([False, False]), REACH_M, np.array([False, True]))
+        assert np.hypot(*(at[1] - at[0])) > 0.9 * KEEP_M
+    assert at[0, 0] > 2.0
+    assert np.hypot(*at[1]) < 0.05
