@@ -46,9 +46,10 @@ app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n
 )
 app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
 app.command(epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(counterfactual)
-app.command(epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`")(
-    bench
-)
+app.command(
+    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
+    "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`"
+)(bench)
 app.command(
     epilog="Examples:  \n"
     '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cosim.cli_crowd import bench_crowd
+from cosim.cli_crowd import bench_crossings, bench_crowd
 
 out = Console()
 err = Console(stderr=True)
@@ -16,16 +16,27 @@ err = Console(stderr=True)
 
 def bench(
     what: Annotated[
-        Literal["environment", "camera", "crowd"],
-        typer.Argument(help="One environment process, the cameras side by side, or how people and vehicles behave."),
+        Literal["environment", "camera", "crowd", "crossings"],
+        typer.Argument(
+            help="One environment process, the cameras side by side, how people and vehicles behave, or how a policy, "
+            "they and the lights get on."
+        ),
     ] = "environment",
     rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
-    cities: Annotated[int, typer.Option(min=1, help="For `crowd`: how many cities.")] = 3,
+    cities: Annotated[
+        int | None, typer.Option(min=1, help="How many cities: 3 for `crowd`, 20 for `crossings` unless you say.")
+    ] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")] = 10.0,
+    crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
+    policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
+    jobs: Annotated[int, typer.Option(min=1, help="For `crossings`: environment processes.")] = 1,
 ) -> None:
-    """Measure one environment process, part by part, the cameras, or what people and vehicles do to each other."""
+    """Measure one environment process, part by part, the cameras, or what robot, people and vehicles do in traffic."""
     if what == "crowd":
-        bench_crowd(cities, minutes)
+        bench_crowd(3 if cities is None else cities, minutes)
+        return
+    if what == "crossings":
+        bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)
         return
     if what == "camera":
         bench_cameras(rounds)

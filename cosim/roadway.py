@@ -18,7 +18,7 @@ import shapely
 from cosim.geometry import Floats, Pose
 from cosim.state import PERSON_RADIUS_M, Street
 from cosim.step import Step
-from cosim.streetmap import StreetMap
+from cosim.streetmap import StreetMap, Strip
 
 BRAKES_MPS2: Final = 2.0
 AHEAD_M: Final = 40.0
@@ -41,11 +41,16 @@ class Roadway:
     def __init__(self, street_map: StreetMap, tick_s: float) -> None:
         self._map, self._tick_s = street_map, tick_s
         self._last: dict[str, int] = {}
+        self._here: shapely.Geometry | None = None
+        self._beside: dict[str, shapely.Geometry] = {}
 
     def see(self, step: Step) -> OnRoad:
         """What a tick did."""
         pose = step.motion.robot.pose
+        if self._here is not None and shapely.contains_xy(self._here, pose.x_m, pose.y_m):
+            return OnRoad()
         place = self._map.locate(pose.x_m, pose.y_m, 0.0)
+        self._here = self._beside_the_road(place.edge) if place.kind == "walk" else None
         strip = self._map.strips.get(place.edge) if place.kind == "walk" else None
         crossing = strip is not None and strip.kind == "crossing"
         signal = step.street.signals.get(place.edge) if crossing else None
@@ -57,6 +62,22 @@ class Roadway:
         new = [name for name in names if (step.tick - self._last.get(name, -(10**9))) * self._tick_s > APART_S]
         self._last |= dict.fromkeys(names, step.tick)
         return OnRoad(carriageway, len(new))
+
+    def _beside_the_road(self, edge: str) -> shapely.Geometry | None:
+        """The part of a walkable piece that is beside the road whatever its signals show: all of a corner, and a
+        sidewalk less the crossings that reach into it. None for a crossing."""
+        strip = self._map.strips.get(edge)
+        if strip is not None and strip.kind == "crossing":
+            return None
+        if edge not in self._beside:
+            piece: shapely.Geometry = strip.polygon if strip is not None else self._map.corners[edge].polygon
+            if strip is not None:
+                others = [s for s in self._map.near("strip", piece) if isinstance(s, Strip)]
+                crossings = [s.polygon for s in others if s.kind == "crossing"]
+                piece = shapely.difference(piece, shapely.union_all(crossings))
+            shapely.prepare(piece)
+            self._beside[edge] = piece
+        return self._beside[edge]
 
 
 def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> list[str]:

@@ -35,7 +35,7 @@ from physics.tiles import key_at
 from scenarios.assemble import clear_of, place
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
-from scenarios.crowd_tally import GRACE_S, Tally
+from scenarios.crowd_tally import Tally
 from scenarios.long_horizon import build
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.stoplines import StopLines
@@ -151,13 +151,7 @@ def drive(scenario: Scenario, street_map: StreetMap, limit_ticks: int) -> tuple[
             street = step.street_after
             persons += sum(name.startswith("c") for name in street.people.ids)
             tally.see(street)
-            for passed in lines.passed(street.vehicles.ids):
-                tally.counts["vehicles passed stop lines"] += 1
-                if passed.light == "y":
-                    tally.counts["vehicles passed at yellow"] += 1
-                elif passed.light == "r":
-                    late = passed.red_s > GRACE_S
-                    tally.counts[f"vehicles passed {'at red' if late else 'within a second of red'}"] += 1
+            tally.drove(lines.passed(street.vehicles.ids))
             verdict = referee.judge(step)
             if verdict.ended is not None or ticks >= limit_ticks:
                 break

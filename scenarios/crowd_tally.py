@@ -6,8 +6,8 @@ Everything is about what is shown: the people and vehicles of a `Street`, after 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import shapely
@@ -17,6 +17,9 @@ from scipy.spatial import cKDTree
 from cosim.geometry import Floats, boxes_overlap
 from cosim.state import PERSON_RADIUS_M, People, Street, Vehicles
 from cosim.streetmap import StreetMap, Strip
+
+if TYPE_CHECKING:
+    from sumo_nets.stoplines import Passed
 
 CONTACT_M: Final = 1.5
 """Two people whose centres are nearer than this are in contact range."""
@@ -47,14 +50,19 @@ class Tally:
     """Counts of one place. `counts`: seconds of pairs, seconds of persons, numbers of entries, by name.
 
     things: what cannot be walked through, as (kind, ground). crossings: ids of the signalised ones that were entered.
+    at_red: who and what went at red, when and where, in words.
     """
 
-    def __init__(self, street_map: StreetMap, tick_s: float, things: Sequence[tuple[str, shapely.Geometry]]) -> None:
+    def __init__(
+        self, street_map: StreetMap, tick_s: float, things: Sequence[tuple[str, shapely.Geometry]] = ()
+    ) -> None:
         self.counts: defaultdict[str, float] = defaultdict(float)
         self.crossings: set[str] = set()
+        self.at_red: list[str] = []
         self._map, self._tick_s = street_map, tick_s
         self._kinds = [kind for kind, _ in things]
         self._things = shapely.STRtree([ground for _, ground in things])
+        self._tick = -1
         self._since: dict[str, int] = {}
         self._red_s: dict[str, float] = {}
         self._on: dict[str, str] = {}
@@ -71,6 +79,21 @@ class Tally:
         if street.tick % EVERY_TICKS == 0 and len(people):
             self._penetrations(people, street.vehicles)
         self._signals(street)
+        self._tick = street.tick
+
+    def drove(self, passed: Iterable[Passed]) -> None:
+        """Take in the vehicles that drove over stop lines in the last tick."""
+        for one in passed:
+            self.counts["vehicles passed stop lines"] += 1
+            if one.light in "Gg":
+                self.counts["vehicles passed at green"] += 1
+            elif one.light in "yY":
+                self.counts["vehicles passed at yellow"] += 1
+            elif one.light == "r" and one.red_s > GRACE_S:
+                self.counts["vehicles passed at red"] += 1
+                self.at_red.append(f"{one.vehicle} at tick {self._tick}, red for {one.red_s:.2f} s")
+            elif one.light == "r":
+                self.counts["vehicles passed within a second of red"] += 1
 
     def _pairs(self, tick: int, people: People) -> None:
         if len(people) < 2:
@@ -142,7 +165,7 @@ class Tally:
                 name = people.ids[i]
                 now[name] = crossing
                 if self._on.get(name) != crossing and street.tick > self._since[name]:
-                    self._entered(crossing, self._red_s[crossing])
+                    self._entered(name, crossing, self._red_s[crossing], street.tick)
             if looks and signal.walk and len(vehicles):
                 boxes = np.column_stack([vehicles.xy, vehicles.heading])
                 hit = boxes_overlap(middle, half, boxes, vehicles.size / 2) & (vehicles.speed > ROLLING_MPS)
@@ -152,11 +175,12 @@ class Tally:
         if looks:
             self._over = over
 
-    def _entered(self, crossing: str, red_s: float) -> None:
+    def _entered(self, person: str, crossing: str, red_s: float, tick: int) -> None:
         self.crossings.add(crossing)
         self.counts["persons entered signalised crossings"] += 1
         if red_s > GRACE_S:
             self.counts["persons entered at red"] += 1
+            self.at_red.append(f"{person} on {crossing} at tick {tick}, red for {red_s:.2f} s")
         elif red_s > 0.0:
             self.counts["persons entered within a second of red"] += 1
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from types import MappingProxyType
 
 import numpy as np
@@ -13,7 +14,7 @@ from cosim.geometry import Pose
 from cosim.roadway import OnRoad, Roadway, braking_for
 from cosim.state import STILL, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.step import Step
-from cosim.streetmap import Lane, StreetMap, Strip
+from cosim.streetmap import Corner, Lane, Located, StreetMap, Strip
 
 LINE = np.array([[20.0, -4.0], [20.0, 4.0]])
 CROSSING = Strip(":j_c0", "crossing", LINE, 4.0, shapely.box(18.0, -4.0, 22.0, 4.0), (None, None), signalised=True)
@@ -71,3 +72,31 @@ def test_a_green_crossing_makes_nobody_brake() -> None:
     for walk, braked in ((True, 0), (False, 1)):
         seen = Roadway(MAP, 0.05).see(step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk)))
         assert seen.braked == braked
+
+
+def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
+    """On a walk over sidewalk, corner and crossing in a fixed order, red and green, it says what a fresh one says."""
+    side = Strip(
+        "s", "sidewalk", np.array([[0.0, 6.0], [40.0, 6.0]]), 4.4, shapely.box(0.0, 3.8, 40.0, 8.2), (None, None)
+    )
+    corner = Corner("w", shapely.box(16.0, 3.0, 24.0, 9.0), ())
+    street_map = StreetMap("m", MAP.bounds, {"s": side, **MAP.strips}, {"w": corner}, MAP.lanes, {})
+    looks: list[tuple[float, float]] = []
+
+    class Counted(StreetMap):
+        def locate(self, x_m: float, y_m: float, slack_m: float = 0.8) -> Located:
+            looks.append((x_m, y_m))
+            return super().locate(x_m, y_m, slack_m)
+
+    counted = Counted(**{f.name: getattr(street_map, f.name) for f in fields(street_map) if f.init})
+    kept = Roadway(counted, 0.05)
+    rng = np.random.default_rng(4)
+    walk = np.concatenate(
+        [np.column_stack([np.linspace(1.0, 15.0, 100), np.full(100, 6.0)]), rng.uniform((0, -5), (40, 9), (2000, 2))]
+    )
+    for tick, (x_m, y_m) in enumerate(walk.tolist()):
+        after = street(7.7, tick % 2 == 0)
+        this = step(100 * tick, x_m, y_m, street(8.0, tick % 2 == 0), after)
+        assert kept.see(this) == Roadway(street_map, 0.05).see(this)
+        if tick == 99:
+            assert len(looks) == 1
