@@ -11,15 +11,13 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
-from xml.parsers import expat
 
 import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from cosim.errors import MapError
 from cosim.geometry import Floats
-from sumo_nets.osmfile import MapFile
+from sumo_nets.osmfile import MapFile, scanned
 
 STOREY_M = 3.2
 LOWEST_M, HIGHEST_M = 2.5, 150.0
@@ -113,13 +111,8 @@ class _Scan:
 
 def osm_features(file: MapFile) -> Found:
     """What an OSM file shows beside its streets. Raises MapError when the file itself is broken."""
-    scan, parser = _Scan(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = scan.start, scan.end
-    try:
-        with file.path.open("rb") as stream:
-            parser.ParseFile(stream)
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        raise MapError(f"{file.source}: broken OpenStreetMap file: {error}: get it again") from error
+    scan = _Scan()
+    scanned(file, scan)
     skipped: Counter[str] = Counter()
     things = [*_spots(scan, skipped), *_rows(scan, skipped), *_buildings(scan, skipped)]
     return Found(tuple(things), dict(sorted(skipped.items())))

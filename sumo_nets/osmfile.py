@@ -12,7 +12,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Literal
+from typing import IO, Literal, Protocol
 from xml.parsers import expat
 
 import numpy as np
@@ -198,10 +198,17 @@ class _Scan:
         self.way = None
 
 
-def osm_facts(file: MapFile) -> OsmFacts:
-    """Facts of an OSM file, from one pass over it. Raises MapError when it is broken or holds no street."""
-    scan, parser = _Scan(), expat.ParserCreate()
-    parser.StartElementHandler, parser.EndElementHandler = scan.start, scan.end
+class Elements(Protocol):
+    """Takes in the elements of an OSM file, one after another."""
+
+    def start(self, tag: str, attributes: dict[str, str]) -> None: ...
+    def end(self, tag: str) -> None: ...
+
+
+def scanned(file: MapFile, elements: Elements) -> None:
+    """Show the elements of an OSM file. Raises MapError when it is broken."""
+    parser = expat.ParserCreate()
+    parser.StartElementHandler, parser.EndElementHandler = elements.start, elements.end
     try:
         with file.path.open("rb") as stream:
             parser.ParseFile(stream)
@@ -210,6 +217,12 @@ def osm_facts(file: MapFile) -> OsmFacts:
         raise MapError(f"{file.source}: broken OpenStreetMap file: {said}: get it again") from error
     except ValueError as error:
         raise MapError(f"{file.source}: broken OpenStreetMap file: {error}: get it again") from error
+
+
+def osm_facts(file: MapFile) -> OsmFacts:
+    """Facts of an OSM file, from one pass over it. Raises MapError when it is broken or holds no street."""
+    scan = _Scan()
+    scanned(file, scan)
     if not scan.lonlat or not scan.roads + scan.on_foot:
         raise MapError(
             f"{file.source}: an OpenStreetMap file of {len(scan.lonlat)} nodes and {scan.ways} ways, none of them a "

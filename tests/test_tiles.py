@@ -12,7 +12,7 @@ from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from physics.buildings import Frontage
 from physics.frontage import frontage_in
 from physics.paint import paint_in
-from physics.tiles import CURB_M, TILE_M, Tile, build_tile, distance_to, key_at, keys_within, square
+from physics.tiles import CURB_M, TILE_M, Key, Tile, build_tile, distance_to, key_at, keys_within, square
 
 
 def tiny_map() -> StreetMap:
@@ -76,21 +76,24 @@ def test_a_tile_is_covered_once() -> None:
         assert abs(areas.sum() - TILE_M**2) < 1e-6
 
 
+def no_cracks(key: Key, corners: np.ndarray) -> None:
+    """Every edge off the border of a tile of (N, 3, 3) triangles is shared by two of them."""
+    edges: dict[frozenset[tuple[int, ...]], int] = {}
+    for triangle in np.rint(corners * 1e3).astype(int).tolist():
+        for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
+            edge = frozenset((tuple(a), tuple(b)))
+            edges[edge] = edges.get(edge, 0) + 1
+    x0, y0, x1, y1 = (round(1e3 * c) for c in square(key))
+    for edge, count in edges.items():
+        xs, ys = {p[0] for p in edge}, {p[1] for p in edge}
+        on_border = xs in ({x0}, {x1}) or ys in ({y0}, {y1}) or len(edge) == 1 or (len(xs) == len(ys) == 1)
+        assert count == 2 or on_border, (key, edge, count)
+
+
 def test_neighbouring_triangles_share_their_corners() -> None:
     """Within a tile every edge off the border is shared by two triangles, walls and their feet included."""
     for key, tile in TILES.items():
-        corners = np.concatenate([triangles(tile, name) for name in tile.parts])
-        points = np.rint(corners * 1e3).astype(int)
-        edges = {}
-        for triangle in points.tolist():
-            for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
-                edge = frozenset((tuple(a), tuple(b)))
-                edges[edge] = edges.get(edge, 0) + 1
-        x0, y0, x1, y1 = (round(1e3 * c) for c in square(key))
-        for edge, count in edges.items():
-            xs, ys = {p[0] for p in edge}, {p[1] for p in edge}
-            on_border = xs in ({x0}, {x1}) or ys in ({y0}, {y1}) or len(edge) == 1 or (len(xs) == len(ys) == 1)
-            assert count == 2 or on_border, (key, edge, count)
+        no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
 
 
 def test_heights_meet_at_tile_borders() -> None:
