@@ -41,10 +41,12 @@ def bench(
     if what == "camera":
         bench_cameras(rounds)
         return
+    from scenarios import bench_street
     from scenarios.bench import PARTS, measure, spread
 
     with err.status("measuring ...") as status:
         report = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+        streets = bench_street.measure(rounds, lambda words: status.update(f"measuring: {words}"))
     table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
     rows: list[tuple[str, list[float], str]] = [
         ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
@@ -62,6 +64,13 @@ def bench(
         inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
         parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
     out.print(parts)
+    around = f"{bench_street.VEHICLES} vehicles, robot, {bench_street.CAST} event pedestrians"
+    street = Table(f"step of the street: {around}", "median", "spread", "target")
+    for (persons, taken), target in zip(streets.items(), ("<= 1.0", "<= 2.0"), strict=True):
+        street.add_row(f"{persons} persons within 80 m, ms", *spread([one.ms for one in taken]), target)
+        street.add_row("  of it inside SUMO's step, ms", *spread([one.engine_ms for one in taken]), "")
+        street.add_row("  people shown", *spread([one.shown for one in taken]), "")
+    out.print(street)
     places = Table("2 km city", "median", "spread", "target")
     places.add_row("seed to street map, s", *spread([p.made_s for p in report.places]), "<= 4")
     places.add_row("cache to street map, s", *spread([p.read_s for p in report.places]), "<= 0.5")

@@ -232,10 +232,10 @@ def measure(rounds: int, tell: Callable[[str], None]) -> Report:
     return report
 
 
-def alone(work: Callable[[float], Any], size_m: float) -> Any:
-    """Run `work(size_m)` in a fresh process."""
+def alone(work: Callable[[Any], Any], size: float) -> Any:
+    """Run `work(size)` in a fresh process."""
     with multiprocessing.get_context("spawn").Pool(1, initializer=_quiet) as pool:
-        return pool.apply(work, (size_m,))
+        return pool.apply(work, (size,))
 
 
 def _quiet() -> None:
