@@ -1,12 +1,20 @@
 """The director of the event pedestrians, at either end of a Zenoh session.
 
 Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see `cosim.events`), so a
-query may be repeated and a director restarted without changing the episode.
+query may be repeated and a director killed and started again without changing the episode.
+
+Both ends sign what they say with the version of their behaviours: a director that would do something else is refused,
+never believed.
 """
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Callable
+from typing import Annotated, TypeVar
+
+import msgspec
 
 from bridge.codec import decode, encode
 from bridge.session import Session
@@ -14,30 +22,102 @@ from cosim.errors import DirectorLost, EngineError
 from cosim.events import EventQuery, EventReply
 
 React = Callable[[EventQuery], EventReply]
+Waiting = Callable[[str], None]
+
+NOTICE_S = 2.0
+"""After so long without an answer whoever runs the episode is told what it waits for."""
+LONGEST_REASON = 500
+"""Letters: what a broken director says may be of any length."""
+
+T = TypeVar("T", bound=msgspec.Struct)
 
 
-def serve_director(session: Session, key: str, react: React) -> None:
-    """Answer the simulator's queries on `key` with the pure function `react`."""
-    session.serve(key, lambda payload: encode(react(decode(payload, EventQuery))))
+class Outside(msgspec.Struct, frozen=True, kw_only=True):
+    """A director in a process of its own. endpoint: where it listens; run: the run's name in the keys; wait_s: how long
+    an episode waits for it before it is recorded as crashed."""
+
+    endpoint: str
+    run: str
+    wait_s: float
+
+
+class Signed(msgspec.Struct, frozen=True):
+    """by: the version of the behaviours of whoever sends it."""
+
+    by: Annotated[str, msgspec.Meta(max_length=64)] = ""
+    message: msgspec.Raw = msgspec.Raw(b"")
+
+
+def signed(message: msgspec.Struct, by: str) -> bytes:
+    """A message with the version of its sender's behaviours."""
+    return encode(Signed(by, msgspec.Raw(encode(message))))
+
+
+def opened(payload: bytes, kind: type[T], by: str) -> T:
+    """The message in `payload`. Raises EngineError when it is none, or its sender's behaviours are others than `by`."""
+    envelope = decode(payload, Signed)
+    if envelope.by != by:
+        raise EngineError(
+            f"behaviours '{envelope.by}' met behaviours '{by}': run and director must be started from the same code"
+        )
+    return decode(bytes(envelope.message), kind)
+
+
+def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
+    """Answer the simulator's queries on `key` with the pure function `react`. by: the version of its behaviours."""
+    session.serve(key, lambda payload: signed(react(opened(payload, EventQuery, by)), by))
 
 
 class RemoteDirector:
-    """The simulator's end: a `cosim.ports.Director` that asks over Zenoh."""
+    """The simulator's end: a `cosim.ports.Director` that asks over Zenoh.
 
-    def __init__(self, session: Session, key: str, *, timeout_s: float = 10.0) -> None:
-        self._session = session
-        self._key = key
-        self._timeout_s = timeout_s
+    by: the version of the simulator's behaviours. wait_s: how long an answer is waited for; waiting: told so, once
+    NOTICE_S are over.
+    """
+
+    def __init__(
+        self, session: Session, key: str, *, by: str = "", wait_s: float = 10.0, waiting: Waiting | None = None
+    ) -> None:
+        self._session, self._key, self._by = session, key, by
+        self._wait_s, self._waiting = wait_s, waiting
 
     def react(self, query: EventQuery) -> EventReply:
         """The director's reply. Raises DirectorLost when none comes or it answers something else."""
         try:
-            reply = decode(self._session.ask(self._key, encode(query), timeout_s=self._timeout_s), EventReply)
+            reply = opened(self._ask(signed(query, self._by), query.tick), EventReply, self._by)
+            _check(reply, query)
         except (TimeoutError, EngineError) as error:
-            raise DirectorLost(f"tick {query.tick} of '{query.episode}': {error}") from error
-        if (reply.episode, reply.tick) != (query.episode, query.tick) or len(reply.states) != len(query.events):
-            raise DirectorLost(
-                f"tick {query.tick} of '{query.episode}': the director answered tick {reply.tick} of "
-                f"'{reply.episode}' with {len(reply.states)} states for {len(query.events)} events"
-            )
+            why = str(error)[:LONGEST_REASON]
+            raise DirectorLost(f"director, tick {query.tick} of '{query.episode}': {why}") from error
         return reply
+
+    def _ask(self, payload: bytes, tick: int) -> bytes:
+        """The answer, however often it takes until the time is over."""
+        began = time.monotonic()
+        if self._waiting is not None and self._wait_s > NOTICE_S:
+            try:
+                return self._session.ask(self._key, payload, timeout_s=NOTICE_S)
+            except TimeoutError:
+                self._waiting(f"waits at tick {tick} for the director, {self._wait_s:g} s at most")
+        try:
+            return self._session.ask(self._key, payload, timeout_s=self._wait_s - (time.monotonic() - began))
+        except TimeoutError:
+            raise TimeoutError(f"nobody answered on '{self._key}' for {self._wait_s:g} s") from None
+
+
+def _check(reply: EventReply, query: EventQuery) -> None:
+    """Raises EngineError for an answer to something else, or one that nobody could be shown by."""
+    if (reply.episode, reply.tick) != (query.episode, query.tick):
+        raise EngineError(f"it answered tick {reply.tick} of '{reply.episode}'")
+    people = [event.people for event in query.events]
+    if [len(state.walkers) for state in reply.states] != people:
+        raise EngineError(f"it answered with {len(reply.states)} states for {len(people)} events, or with other people")
+    known = {f"{e.id}-{i}" if i else e.id for e in query.events for i in range(e.people)}
+    shown = {actor.id for actor in reply.actors}
+    if len(shown) < len(reply.actors) or not shown <= known:
+        raise EngineError(f"it showed people of no event, or twice: {', '.join(sorted(shown - known)[:5])}")
+    walkers = [walker for state in reply.states for walker in state.walkers]
+    told = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
+    told += sum(abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) for a in reply.actors)
+    if not math.isfinite(told):
+        raise EngineError("it answered with a place, heading or speed that is no number")

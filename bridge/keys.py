@@ -31,5 +31,8 @@ def director(run: str, env: str) -> str:
     return f"cosim/{name(run)}/env/{name(env)}/director"
 
 
+EVERY_DIRECTOR = "cosim/*/env/*/director"
+"""What a director of any run answers."""
+
 EVERY_STATUS = "cosim/*/env/*/status"
 """Asked, every running episode answers."""

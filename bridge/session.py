@@ -63,17 +63,20 @@ class Session:
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
 
+        key: may hold wildcards; then queries on every key of that form are answered, each on its own.
         found: queries on key expressions that include `key` are answered too.
         """
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                if str(query.key_expr) != key and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
-                    query.reply_err(f"ask for exactly '{key}', not '{query.key_expr}'".encode())
+                asked = str(query.key_expr)
+                many = "*" in asked
+                if many and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
+                    query.reply_err(f"ask for exactly '{key}', not '{asked}'".encode())
                     return
                 payload = query.payload.to_bytes() if query.payload is not None else b""
                 try:
-                    query.reply(key, handler(payload))
+                    query.reply(key if many else asked, handler(payload))
                 except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
@@ -104,7 +107,11 @@ class Session:
         deadline = time.monotonic() + timeout_s
         pause_s = _FIRST_RETRY_S
         while (left_s := deadline - time.monotonic()) > 0:
-            for reply in self._session.get(key, payload=payload, timeout=left_s):
+            # Unconsolidated: else a reply is held back until every other side has said that it has none.
+            replies = self._session.get(
+                key, payload=payload, timeout=left_s, consolidation=zenoh.ConsolidationMode.NONE
+            )
+            for reply in replies:
                 if reply.ok is not None:
                     return bytes(reply.ok.payload.to_bytes())
                 message = reply.err.payload.to_string() if reply.err is not None else ""

@@ -27,7 +27,7 @@ from cosim.cli_bench import bench
 from cosim.cli_city import city_app
 from cosim.cli_crowd import counterfactual
 from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
-from cosim.cli_live import checked_endpoint, inject, listen, replay
+from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
 from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
 from cosim.errors import CosimError, UsageError
@@ -56,6 +56,10 @@ app.command(
     "`cosim inject @anna.json --env mine/lh-011-00`"
 )(inject)
 app.command(epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
+app.command(
+    epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"
+    "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`"
+)(direct)
 app.command(epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
 out = Console()
 err = Console(stderr=True)
@@ -90,9 +94,16 @@ def run(
     live: Annotated[
         str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
     ] = None,
+    director: Annotated[
+        str | None, typer.Option(help="Ask the director at this endpoint, a process of its own: see `cosim direct`.")
+    ] = None,
+    director_wait: Annotated[
+        float, typer.Option(min=0.1, max=LONGEST_WAIT_S, help="Seconds to wait for it; then the episode has crashed.")
+    ] = 60.0,
 ) -> None:
     """Run a suite with a policy and print its table."""
     from bridge import keys
+    from bridge.director import Outside
     from bridge.session import Session
     from cosim.injection import Live
     from cosim.policies.load import load_policy
@@ -130,7 +141,11 @@ def run(
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
-    on_air = None if live is None else Live(endpoint=checked_endpoint(live), run=keys.chunk(path.name))
+    on_air = None if live is None else Live(endpoint=checked_endpoint(live, "--live"), run=keys.chunk(path.name))
+    outside = None
+    if director is not None:
+        endpoint = checked_endpoint(director, "--director")
+        outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
     held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
     with held, nullcontext() if on_air is None else Session.hub(on_air.endpoint):
         done = held.finished()
@@ -152,6 +167,7 @@ def run(
                     frames_every_s=frames,
                     camera=drawn_by,
                     live=on_air,
+                    outside=outside,
                 )
         except KeyboardInterrupt:
             finished = len(held.finished())
@@ -273,7 +289,7 @@ class Board:
 
     def tell(self, message: object) -> None:
         """Take in what a worker says."""
-        from scenarios.messages import Done
+        from scenarios.messages import Done, Waits
         from scenarios.messages import Progress as Report
 
         if isinstance(message, Report):
@@ -284,6 +300,8 @@ class Board:
                 self._tasks[message.scenario] = task
             note = f"m  {message.time_s:.0f} s simulated, {message.failures} failures"
             self.bars.update(task, completed=round(message.route_s_m), note=note)
+        elif isinstance(message, Waits):
+            err.print(f"{message.scenario}: {message.reason}", soft_wrap=True, highlight=False, markup=False)
         elif isinstance(message, Done):
             task = self._tasks.pop(message.scenario, None)
             if task is not None:

@@ -1,7 +1,8 @@
-"""The command line of running episodes: `cosim inject`, `cosim listen`; and `cosim replay` of finished ones."""
+"""The command line beside running episodes: `cosim inject`, `listen`, `direct`; and `cosim replay` of finished ones."""
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from pathlib import Path
@@ -16,7 +17,10 @@ out = Console()
 err = Console(stderr=True)
 
 DEFAULT = "tcp/127.0.0.1:7447"
+DIRECTOR = "tcp/127.0.0.1:7448"
 SEARCH_S = 1.0
+LONGEST_WAIT_S = 240.0
+"""For a director: an environment process that says nothing for much longer is taken to hang (`scenarios.pool`)."""
 
 Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
 Env = Annotated[str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")]
@@ -60,6 +64,28 @@ def listen(
         session.listen(f"{below}/{topic}", lambda _, payload: print(payload.decode(), flush=True))
         try:
             time.sleep(seconds if seconds is not None else 1e9)
+        except KeyboardInterrupt:
+            raise typer.Exit(130) from None
+
+
+def direct(
+    listen: Annotated[str, typer.Option(help="Where runs find it.")] = DIRECTOR,
+) -> None:
+    """Direct the event pedestrians of runs that were started with --director, until stopped.
+
+    It keeps nothing: stop it, kill it and start it again in the middle of an episode, and the episode waits, goes on
+    and comes to the same state hash. A run of other code is refused.
+    """
+    from bridge.session import Session
+    from scenarios.directing import behaviours, serve
+
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with Session.hub(checked_endpoint(listen, "--listen")) as session:
+        serve(session)
+        print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
+        try:
+            while True:
+                time.sleep(3600.0)
         except KeyboardInterrupt:
             raise typer.Exit(130) from None
 
@@ -108,8 +134,8 @@ def _chosen(session: object, env: str | None) -> str:
     return found[0]
 
 
-def checked_endpoint(endpoint: str) -> str:
-    """An endpoint that can be listened at, as zenoh writes it. Raises UsageError."""
+def checked_endpoint(endpoint: str, option: str) -> str:
+    """An endpoint of an option, as zenoh writes it. Raises UsageError."""
     if not endpoint.startswith(("tcp/", "unixsock-stream/", "tls/", "udp/", "quic/")):
-        raise UsageError(f"--live '{endpoint}': write it as PROTOCOL/ADDRESS, like {DEFAULT}")
+        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS, like {DEFAULT}")
     return endpoint

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
@@ -12,14 +11,11 @@ from pathlib import Path
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
-from bridge import keys
-from bridge.director import RemoteDirector, serve_director
-from bridge.session import Session
 from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.injection import Injected
 from cosim.loop import Parts
-from cosim.ports import CameraSpec, Director, Eyes, Policy
+from cosim.ports import CameraSpec, Eyes, Policy
 from cosim.record import NO_RENDERER
 from cosim.roadway import Roadway
 from cosim.scenario import City, Place, Scenario
@@ -28,7 +24,7 @@ from physics.cameras import CameraChoice, camera_of, chosen, renderer_of
 from physics.furniture import Prop, footprints
 from physics.world import BulletWorld
 from scenarios.barriers import fenced
-from scenarios.behaviors import react
+from scenarios.directing import Direct, directed
 from scenarios.guests import Guests
 from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
@@ -59,11 +55,16 @@ class Stage:
 
 @contextmanager
 def staged(
-    scenario: Scenario, policy: Policy, choice: CameraChoice = "auto", script: Sequence[Injected] = ()
+    scenario: Scenario,
+    policy: Policy,
+    choice: CameraChoice = "auto",
+    script: Sequence[Injected] = (),
+    direct: Direct = directed,
 ) -> Iterator[Stage]:
     """Start every engine of a scenario; all are closed at the end, whatever happened.
 
     choice: what draws pictures. script: pedestrians that were injected into the episode that is replayed.
+    direct: gives the director of its event pedestrians.
     """
     manifest = policy.manifest
     clock = Clock.for_rate(manifest.rate_hz)
@@ -87,7 +88,7 @@ def staged(
         camera, renderer = None, NO_RENDERER
         if manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(chosen(choice))
-        director = stack.enter_context(directed(scenario.id))
+        director = stack.enter_context(direct(scenario.id))
         half_width_m = world.footprint_m[1] / 2
         footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
         free = shapely.buffer(footing, -half_width_m)
@@ -107,17 +108,6 @@ def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | M
     ground = footprints(props)
     ground = ground[shapely.intersects(area, ground)]
     return shapely.difference(area, shapely.union_all(ground)) if len(ground) else area  # type: ignore[return-value]
-
-
-@contextmanager
-def directed(env: str) -> Iterator[Director]:
-    """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
-    with ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cosim-zenoh-"))
-        endpoint = f"unixsock-stream/{folder}/hub.sock"
-        key = keys.director("local", keys.chunk(env))
-        serve_director(stack.enter_context(Session.hub(endpoint)), key, react)
-        yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
 
 
 @lru_cache(maxsize=1)

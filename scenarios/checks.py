@@ -18,7 +18,8 @@ from cosim.scenario import City, CrowdSpec, Scenario
 from cosim.versions import versions
 from cosim.walks import WalkGraph
 from physics.cameras import chosen, renderer_of
-from scenarios.assemble import directed, place, staged
+from scenarios.assemble import place, staged
+from scenarios.directing import directed
 from scenarios.long_horizon import build
 from sumo_nets.store import cache_folder
 

@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from bridge.director import Outside
 from cosim.injection import Live
 from cosim.record import Status
 from cosim.scenario import Scenario
@@ -14,7 +15,8 @@ from cosim.scenario import Scenario
 class Job(msgspec.Struct, frozen=True, tag=True):
     """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames.
 
-    camera: what draws the pictures, the same for a whole run.
+    camera: what draws the pictures, the same for a whole run. outside: the director, when the episode has none of its
+    own.
     """
 
     scenario: Scenario
@@ -23,6 +25,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     frames_every_s: float = 0.0
     camera: Literal["gl", "bullet", "bullet-egl"] = "bullet"
     live: Live | None = None
+    outside: Outside | None = None
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):
@@ -32,6 +35,13 @@ class Progress(msgspec.Struct, frozen=True, tag=True):
     time_s: float
     route_s_m: float
     failures: int
+
+
+class Waits(msgspec.Struct, frozen=True, tag=True):
+    """The episode stands still: what it waits for."""
+
+    scenario: str
+    reason: str
 
 
 class Done(msgspec.Struct, frozen=True, tag=True):
@@ -48,7 +58,7 @@ class Unsaved(msgspec.Struct, frozen=True, tag=True):
     reason: str
 
 
-Message = Progress | Done | Unsaved
+Message = Progress | Waits | Done | Unsaved
 
 encode = msgspec.msgpack.Encoder().encode
 decode_job = msgspec.msgpack.Decoder(Job).decode

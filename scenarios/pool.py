@@ -19,6 +19,7 @@ from pathlib import Path
 
 import msgspec
 
+from bridge.director import Outside
 from cosim.errors import RunError
 from cosim.injection import Live
 from cosim.ports import Manifest
@@ -60,9 +61,13 @@ def run_all(
     frames_every_s: float = 0.0,
     camera: CameraName = "bullet",
     live: Live | None = None,
+    outside: Outside | None = None,
 ) -> None:
-    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends."""
-    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera, live)
+    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends.
+
+    outside: the director of the event pedestrians, when the episodes have none of their own.
+    """
+    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera, live, outside)
     waiting = deque(scenarios)
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
@@ -91,9 +96,11 @@ class _Pool:
         frames_every_s: float,
         camera: CameraName,
         live: Live | None,
+        outside: Outside | None,
     ) -> None:
         self._folder, self._policy, self._manifest = folder, policy, manifest
         self._tell, self._frames_every_s, self._camera, self._live = tell, frames_every_s, camera, live
+        self._outside = outside
         self._workers: list[_Worker] = []
         self._started = 0
 
@@ -109,7 +116,7 @@ class _Pool:
         (Path(target) / "record.json").unlink(missing_ok=True)
         try:
             suite_hash = self._folder.spec.suite_hash
-            job = Job(scenario, suite_hash, target, self._frames_every_s, self._camera, self._live)
+            job = Job(scenario, suite_hash, target, self._frames_every_s, self._camera, self._live, self._outside)
             idle.pipe.send_bytes(encode(job))
         except BrokenPipeError:
             idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out

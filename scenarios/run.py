@@ -23,6 +23,7 @@ from cosim.step import Step
 from cosim.witness import Witness, unwitnessed
 from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
+from scenarios.directing import Direct, directed
 from scenarios.on_air import OnAir
 
 Watch = Callable[[Step, Verdict], None]
@@ -45,15 +46,16 @@ def episode(
     camera: CameraChoice = "auto",
     watch: Watch | None = None,
     live: Live | None = None,
+    direct: Direct = directed,
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
 
-    live: where it is on the air meanwhile.
+    live: where it is on the air meanwhile. direct: gives the director of its event pedestrians.
     """
     began = time.perf_counter()
     record = begun(scenario, policy.manifest, suite_hash)
     try:
-        with staged(scenario, policy, camera) as stage:
+        with staged(scenario, policy, camera, direct=direct) as stage:
             record = replaced(record, renderer=stage.renderer)
             first_tick_s = time.perf_counter() - began
             with ExitStack() as air:

@@ -10,6 +10,7 @@ import os
 import shutil
 import signal
 import sys
+from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,9 +21,10 @@ from cosim.clock import Clock
 from cosim.policies.load import load_policy
 from cosim.referee import Verdict
 from cosim.step import Step
-from scenarios.messages import Done, Job, Message, Progress, Unsaved, decode_job, encode
+from scenarios.messages import Done, Job, Message, Progress, Unsaved, Waits, decode_job, encode
 
 if TYPE_CHECKING:
+    from scenarios.directing import Direct
     from scenarios.run import Watch
 
 REPORT_EVERY_TICKS = 20
@@ -49,7 +51,13 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
             return
         watch = watcher(job, pipe)
         outcome = episode(
-            job.scenario, driver, suite_hash=job.suite_hash, camera=job.camera, watch=watch, live=job.live
+            job.scenario,
+            driver,
+            suite_hash=job.suite_hash,
+            camera=job.camera,
+            watch=watch,
+            live=job.live,
+            direct=director_of(job, pipe),
         )
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
@@ -64,6 +72,15 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
             send(pipe, Unsaved(job.scenario.id, f"{folder}: {error.strerror}"))
             continue
         send(pipe, Done(job.scenario.id, outcome.record.status))
+
+
+def director_of(job: Job, pipe: Connection) -> Direct:
+    """The episode's own director, or the one outside that the job names; waits for that one are reported."""
+    from scenarios.directing import directed, directed_by
+
+    if job.outside is None:
+        return directed
+    return partial(directed_by, job.outside, lambda reason: send(pipe, Waits(job.scenario.id, reason)))
 
 
 def watcher(job: Job, pipe: Connection) -> Watch:

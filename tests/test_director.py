@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import math
 import time
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import RemoteDirector, serve_director
+from bridge.director import RemoteDirector, opened, serve_director, signed
 from bridge.session import Session
 from cosim.errors import DirectorLost, EngineError, SpecError
-from cosim.events import EventQuery, EventReply
+from cosim.events import Actor, Event, EventQuery, EventReply, EventState, Walker
 
 pytestmark = pytest.mark.engine
 
@@ -59,7 +62,7 @@ def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
     with Session.hub(endpoint(tmp_path)), Session.client(endpoint(tmp_path)) as client:
         began = time.monotonic()
         with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
-            RemoteDirector(client, KEY, timeout_s=0.5).react(query())
+            RemoteDirector(client, KEY, wait_s=0.5).react(query())
         assert 0.4 < time.monotonic() - began < 3.0
 
 
@@ -81,12 +84,88 @@ def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
             RemoteDirector(client, KEY).react(query(0))
 
 
+def event(**fields: object) -> Event:
+    known: dict[str, object] = {"id": "e0", "kind": "frontal", "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0}
+    return Event(**known | {"route_s_m": 5.0, "half_width_m": 1.0} | fields)  # type: ignore[arg-type]
+
+
+SANE = EventState(phase="waiting", since_tick=0, walkers=(Walker(x_m=1.0, y_m=0.0, heading_rad=0.0),))
+NOWHERE = msgspec.structs.replace(SANE, walkers=(Walker(x_m=math.nan, y_m=0.0, heading_rad=0.0),))
+CROWDED = msgspec.structs.replace(SANE, walkers=SANE.walkers * 3)
+SHOWN = Actor(id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand")
+FAST = msgspec.structs.replace(SHOWN, speed_mps=math.inf)
+STRANGER = msgspec.structs.replace(SHOWN, id="e7")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"tick": 4}, "it answered tick 4 of 't'"),
+        ({"episode": "u"}, "it answered tick 5 of 'u'"),
+        ({"states": ()}, "0 states for 1 events"),
+        ({"states": (SANE,) * 10_000}, "10000 states for 1 events"),
+        ({"states": (CROWDED,)}, "or with other people"),
+        ({"states": (NOWHERE,)}, "no number"),
+        ({"actors": (FAST,)}, "no number"),
+        ({"actors": (STRANGER,)}, "people of no event, or twice: e7"),
+        ({"actors": (SHOWN, SHOWN)}, "people of no event, or twice"),
+    ],
+)
+def test_a_reply_that_cannot_be_meant_is_refused_in_words(tmp_path: Path, fields: dict[str, Any], words: str) -> None:
+    """The last tick's, another episode's, too many states, people of nobody, places that are none."""
+    asked = msgspec.structs.replace(query(5), events=(event(),))
+    sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {}))
+        director = RemoteDirector(client, KEY)
+        assert director.react(asked) == sane
+        asked = msgspec.structs.replace(asked, states=sane.states)
+        with pytest.raises(DirectorLost, match=f"tick 5 of 't'.*{words}"):
+            director.react(asked)
+
+
+@pytest.mark.parametrize("theirs", ["feed", ""])
+def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) -> None:
+    """Whatever it would do: both ends sign with their version, and each refuses the other's."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, echo, by=theirs)
+        with pytest.raises(DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"):
+            RemoteDirector(client, KEY, by="cafe").react(query())
+        lax = keys.director("test", "lax")
+        hub.serve(lax, lambda payload: signed(echo(opened(payload, EventQuery, "cafe")), theirs))
+        with pytest.raises(DirectorLost, match=f"'{theirs}' met behaviours 'cafe'"):
+            RemoteDirector(client, lax, by="cafe").react(query())
+
+
+def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
+    """Served on a key with wildcards it answers any concrete one, and still no wildcard query."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, keys.EVERY_DIRECTOR, echo)
+        for run, env in (("a", "x"), ("b", "y")):
+            assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
+        with pytest.raises(EngineError, match="ask for exactly"):
+            client.ask(keys.director("a", "x").replace("a", "*", 1), signed(query(), ""), timeout_s=3.0)
+
+
+def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> None:
+    """Once, after two seconds; the director that comes then is taken."""
+    told: list[str] = []
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+
+        def waiting(words: str) -> None:
+            told.append(words)
+            serve_director(hub, KEY, echo)
+
+        assert RemoteDirector(client, KEY, wait_s=20.0, waiting=waiting).react(query(3)).tick == 3
+    assert told == ["waits at tick 3 for the director, 20 s at most"]
+
+
 @pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x91" * 100_000, b"\x80\x04."])
 def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None:
     """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
     with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
-        with pytest.raises(EngineError, match="not a EventQuery message"):
+        with pytest.raises(EngineError, match=r"not a (Signed|EventQuery) message"):
             client.ask(KEY, payload, timeout_s=3.0)
         assert RemoteDirector(client, KEY).react(query(3)).tick == 3
 

@@ -1,0 +1,222 @@
+"""`cosim direct` beside `cosim run --director`: real processes, real kill -9."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from cosim.control import Command
+from cosim.ports import Manifest, Observation
+from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from cosim.walks import WalkGraph
+
+pytestmark = pytest.mark.engine
+
+WORDS = [sys.executable, "-m", "cosim"]
+ENVIRONMENT = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
+
+KILLER = """
+import os, signal
+from pathlib import Path
+from cosim.ports import Manifest
+from cosim.state import Command
+
+class Killer:
+    manifest = Manifest("blind", camera=None)
+    def reset(self, scenario_id, seed):
+        self.tick = 0
+    def act(self, observation):
+        self.tick += 1
+        if self.tick == 20:  # after 4 of 8 s: the event's pedestrian is on its way
+            os.kill(int(Path("director.pid").read_text()), signal.SIGKILL)
+        return Command(1.2, 0.0)
+"""
+
+LIAR = """
+import sys, time
+import msgspec
+from bridge import keys
+from bridge.codec import decode, encode
+from bridge.director import Signed, opened, signed
+from bridge.session import Session
+from cosim.events import EventQuery
+from scenarios.behaviors import react
+from scenarios.directing import behaviours
+
+last = {}
+def lie(payload):
+    query = opened(payload, EventQuery, behaviours())
+    reply, by, replace = react(query), behaviours(), msgspec.structs.replace
+    before, last[query.episode] = last.get(query.episode, reply), reply
+    if query.tick < 3 or query.episode == "honest":
+        return signed(reply, by)
+    match query.episode:
+        case "late": return signed(before, by)
+        case "many": return signed(replace(reply, states=reply.states * 1000), by)
+        case "noise": return b"\\x93\\x01" * 100
+        case "other-code": return signed(reply, "0" * 16)
+        case "huge": return signed(reply, "x" * 10_000_000)
+    raise RuntimeError("no idea")
+
+with Session.hub(sys.argv[1]) as hub:
+    hub.serve(keys.EVERY_DIRECTOR, lie)
+    print("lying", flush=True)
+    time.sleep(600)
+"""
+
+
+class Blind:
+    """Drives straight on, like the one that kills."""
+
+    manifest = Manifest("blind", camera=None)
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(1.2, 0.0)
+
+
+def frontal(scenario_id: str) -> Scenario:
+    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the robot."""
+    from scenarios.assemble import place
+    from scenarios.reactive import build
+
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    whole = build("frontal", city, street_map, WalkGraph(street_map), 1, scenario_id)
+    return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """A process that has said its first line."""
+    process = subprocess.Popen(words, cwd=folder, env=ENVIRONMENT, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline()
+    return process
+
+
+def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
+    return json.loads((folder / "run" / "episodes" / scenario_id / "record.json").read_bytes())
+
+
+def test_a_director_killed_in_mid_episode_leaves_no_trace_and_one_that_stays_away_is_told(tmp_path: Path) -> None:
+    """Killed and started again the episode comes to the hash of an undisturbed one; killed for good, it has crashed."""
+    from scenarios.run import episode
+
+    write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-0"), frontal("t-1"))), tmp_path / "tiny.json")
+    (tmp_path / "killer.py").write_text(KILLER)
+    at = f"unixsock-stream/{tmp_path}/director.sock"
+
+    def direct() -> subprocess.Popen[str]:
+        director = started(tmp_path, *WORDS, "direct", "--listen", at)
+        (tmp_path / "director.pid").write_text(str(director.pid))
+        return director
+
+    first = direct()
+    arguments = ["tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at, "--director-wait", "10"]
+    run = subprocess.Popen(
+        [*WORDS, "run", *arguments],
+        cwd=tmp_path,
+        env=ENVIRONMENT,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    undisturbed = episode(frontal("t-0"), Blind()).record
+    directors = [first]
+    try:
+        assert first.wait(timeout=60) == -9
+        directors.append(direct())
+        assert directors[1].wait(timeout=60) == -9
+        _, told = run.communicate(timeout=60)
+    finally:
+        for process in (run, *directors):
+            process.kill()
+            process.wait()
+    kept, lost = recorded(tmp_path, "t-0"), recorded(tmp_path, "t-1")
+    assert undisturbed.status == "done" and undisturbed.events[0].triggered_at_s == 1.5
+    assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
+    assert run.returncode == 1 and lost["status"] == "crashed"
+    assert "nobody answered on 'cosim/run/env/t-1/director' for 10 s" in lost["reason"]
+    assert "t-1: waits at tick" in told and "10 s at most" in told
+
+
+def test_a_director_that_lies_crashes_its_episodes_and_no_other(tmp_path: Path) -> None:
+    """The last tick's answer, too many states, noise, other code, an exception: each a record with its reason."""
+    says = {
+        "late": "it answered tick 2 of 'late'",
+        "many": "it answered with 1000 states for 1 events",
+        "noise": "not a Signed message",
+        "other-code": "run and director must be started from the same code",
+        "huge": "Expected `str` of length <= 64",
+        "raises": "RuntimeError: no idea",
+    }
+    scenarios = tuple(frontal(name) for name in ("honest", *says))
+    write_suite(Suite(name="tiny", version="1", scenarios=scenarios), tmp_path / "tiny.json")
+    (tmp_path / "liar.py").write_text(LIAR)
+    at = f"unixsock-stream/{tmp_path}/liar.sock"
+    liar = started(tmp_path, sys.executable, "liar.py", at)
+    try:
+        run = subprocess.run(
+            [*WORDS, "run", "tiny.json", "--policy", "straight", "--out", "run", "--director", at],
+            cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True, timeout=120,
+        )  # fmt: skip
+    finally:
+        liar.kill()
+        liar.wait()
+    assert run.returncode == 1 and recorded(tmp_path, "honest")["status"] == "done", run.stderr
+    for name, words in says.items():
+        record = recorded(tmp_path, name)
+        assert record["status"] == "crashed" and words in record["reason"] and len(record["reason"]) < 1000
+        assert f"director, tick 3 of '{name}'" in record["reason"]
+
+
+def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path) -> None:
+    """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is an error."""
+    from bridge.director import Outside
+    from cosim.errors import DirectorLost
+    from cosim.events import EventQuery
+    from scenarios.directing import directed_by
+
+    at = f"unixsock-stream/{tmp_path}/director.sock"
+    query = EventQuery(
+        episode="e", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
+        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
+    )  # fmt: skip
+    told: list[str] = []
+    began = time.monotonic()
+    with (
+        pytest.raises(
+            DirectorLost, match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct"
+        ),
+        directed_by(Outside(endpoint=at, run="r", wait_s=0.5), told.append, "e"),
+    ):
+        pass
+    assert time.monotonic() - began < 10.0
+    directors: list[subprocess.Popen[str]] = []
+    late = threading.Thread(target=lambda: directors.append(started(tmp_path, *WORDS, "direct", "--listen", at)))
+    late.start()
+    try:
+        with directed_by(Outside(endpoint=at, run="r", wait_s=30.0), told.append, "e") as director:
+            assert director.react(query).tick == 0
+        late.join()
+        second = subprocess.run([*WORDS, "direct", "--listen", at], env=ENVIRONMENT, capture_output=True, text=True)
+        assert second.returncode == 1 and f"cannot listen at {at}" in second.stderr
+        directors[0].terminate()
+        assert directors[0].wait(timeout=10) == 130
+    finally:
+        late.join()
+        for process in directors:
+            process.kill()
+            process.wait()
+    bad = subprocess.run([*WORDS, "direct", "--listen", "7448"], env=ENVIRONMENT, capture_output=True, text=True)
+    assert bad.returncode == 2 and "--listen '7448': write it as PROTOCOL/ADDRESS" in bad.stderr
