@@ -26,7 +26,7 @@ from rich.table import Table
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
 from cosim.cli_crowd import counterfactual
-from cosim.cli_eyes import CAMERA_HELP, Choice, camera_here, film, look
+from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
 from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
@@ -41,7 +41,7 @@ app = typer.Typer(
 )
 app.add_typer(city_app, name="city")
 app.add_typer(map_app, name="map")
-app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --view above`")(
+app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`")(
     look
 )
 app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
@@ -69,6 +69,7 @@ err = Console(stderr=True)
     epilog="Examples:  \n"
     "`cosim run long-horizon --policy route --episodes 2`  \n"
     "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
+    "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`"
@@ -89,6 +90,7 @@ def run(
     roughness: Annotated[
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
+    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
     live: Annotated[
@@ -111,7 +113,7 @@ def run(
     from cosim.runfolder import RunFolder, RunSpec
     from cosim.versions import versions
     from physics.cameras import renderer_of
-    from scenarios.catalog import chosen
+    from scenarios.catalog import chosen, with_residents
     from scenarios.catalog import suite as shipped
     from scenarios.pool import run_all
 
@@ -123,6 +125,8 @@ def run(
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
         whole = shipped(suite)
+    if residents is not None:
+        whole = with_residents(whole, residents)
     picked = chosen(whole, scenario or (), episodes, event or ())
     manifest = load_policy(policy).manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"

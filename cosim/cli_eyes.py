@@ -17,6 +17,7 @@ err = Console(stderr=True)
 
 Choice = Literal["auto", "gl", "bullet", "bullet-egl"]
 CAMERA_HELP = "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), or auto: gl where it works."
+RESIDENTS_HELP = "In place of the scenario's: so many people who sit on benches, look into shop windows, wait at stops."
 
 
 def camera_here(choice: Choice) -> Literal["gl", "bullet", "bullet-egl"]:
@@ -38,11 +39,12 @@ def look(
         str, typer.Option(help="Where the scenario is: a suite or a suite's .json file.")
     ] = "long-horizon",
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import chosen
+    from scenarios.catalog import chosen, with_residents
     from scenarios.catalog import suite as shipped
     from scenarios.look import VIEWS, look
 
@@ -50,7 +52,8 @@ def look(
     if picked is None:
         raise unknown("view", view, VIEWS)
     pixels = size_of(size)
-    (one,) = chosen(shipped(suite), [scenario])
+    whole = shipped(suite)
+    (one,) = chosen(whole if residents is None else with_residents(whole, residents), [scenario])
     with err.status(f"driving to {at:g} s ..." if at else "setting up ..."):
         image, time_s = look(one, policy, at, picked, pixels, camera_here(camera))
     save(image, output)

@@ -91,7 +91,8 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
-    """An event pedestrian as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones."""
+    """A pedestrian of ours as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones; a
+    guest's starts with "ei-", a resident's with "n"."""
 
     id: str
     x_m: float

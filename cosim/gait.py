@@ -51,9 +51,9 @@ def stature_m(name: str) -> float:
 
 
 def age_of(name: str) -> str:
-    """'child', 'adult' or 'elder'; event pedestrians are grown up."""
+    """'child', 'adult' or 'elder'; event pedestrians and residents are grown up."""
     share = zlib.crc32(b"age " + name.encode()) / 2**32
-    if share < _CHILD and not name.startswith("e"):
+    if share < _CHILD and name[0] not in "en":
         return "child"
     return "elder" if share > 1.0 - _ELDER else "adult"
 

@@ -43,7 +43,8 @@ class Log:
     travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
     reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
     on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.roadway`.
-    people_tick (P,), people_xy (P, 2), people_event (P,) bool: persons within 30 m, once a second, for pictures.
+    people_tick (P,), people_xy (P, 2), people_event, people_resident (P,) bool: persons within 30 m, once a second,
+    for pictures.
     event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
     """
 
@@ -61,6 +62,7 @@ class Log:
     people_tick: NDArray[np.int64]
     people_xy: Floats
     people_event: NDArray[np.bool_]
+    people_resident: NDArray[np.bool_]
     event_tracks: Floats
 
     def __len__(self) -> int:
@@ -81,7 +83,10 @@ class Log:
         """Read a saved log. Raises RunError naming the file."""
         try:
             with np.load(path, allow_pickle=False) as arrays:
-                values = {name: arrays[name] for name in (f.name for f in fields(cls))}
+                held = dict(arrays)
+                # Logs from before there were residents do not mention them.
+                held.setdefault("people_resident", np.zeros(len(held["people_event"]), dtype=bool))
+                values = {name: held[name] for name in (f.name for f in fields(cls))}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RunError(f"{path}: not a trajectory: {error}") from error
         values["tick_s"] = float(values["tick_s"])
@@ -205,7 +210,7 @@ class Recorder:
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
         self._rows: list[tuple[float, ...]] = []
-        self._people: list[tuple[int, float, float, bool]] = []
+        self._people: list[tuple[int, float, float, bool, bool]] = []
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
@@ -222,12 +227,13 @@ class Recorder:
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             for i in np.flatnonzero(away[: len(people)] < self.PEOPLE_WITHIN_M):
                 x, y = people.xy[i]
-                self._people.append((step.tick, float(x), float(y), people.ids[i].startswith("e")))
+                kind = people.ids[i][0]
+                self._people.append((step.tick, float(x), float(y), kind == "e", kind == "n"))
 
     def log(self, event_tracks: Floats) -> Log:
         """The episode so far. event_tracks: see `Log`."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 14)
-        people = np.array(self._people, dtype=float).reshape(-1, 4)
+        people = np.array(self._people, dtype=float).reshape(-1, 5)
         return Log(
             tick_s=self._tick_s,
             pose=rows[:, 0:3],
@@ -243,5 +249,6 @@ class Recorder:
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_event=people[:, 3] > 0,
+            people_resident=people[:, 4] > 0,
             event_tracks=event_tracks,
         )

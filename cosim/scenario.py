@@ -95,20 +95,26 @@ class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True):
 DEFAULT_PERSONS = 50
 MOST_PER_1000_M2 = 150.0
 """Denser crowds have no room to enter 1.5 m apart."""
+MOST_RESIDENTS = 60
 
 
 class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
     """The street life around the robot: persons and vehicles kept within radius_m of it.
 
     density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
+    residents: people besides who know the street, sit on its benches, look into its shop windows, wait at its stops
+    (`scenarios.residents`); so many are kept within 60 m of the robot.
     """
 
     persons: int = DEFAULT_PERSONS
     radius_m: float = 80.0
     vehicles: int = 20
     density: float | msgspec.UnsetType = msgspec.UNSET
+    residents: int = 0
 
     def __post_init__(self) -> None:
+        if not 0 <= self.residents <= MOST_RESIDENTS:
+            raise SpecError(f"crowd residents must be in [0, {MOST_RESIDENTS}], not {self.residents}")
         if self.persons < 0 or self.vehicles < 0:
             raise SpecError(f"persons and vehicles cannot be negative: {self.persons}, {self.vehicles}")
         if not 20.0 <= self.radius_m <= 500.0:
@@ -220,16 +226,18 @@ def content_hash(spec: msgspec.Struct) -> str:
     return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
 
 
-ADDED: Mapping[str, object] = MappingProxyType({"light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0})
+ADDED: Mapping[str, object] = MappingProxyType(
+    {"light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0, "residents": 0}
+)
 """Fields that came later, with the values that mean what was meant before there were such fields."""
 
 
 def _canonical(spec: msgspec.Struct) -> bytes:
-    """JSON of a spec. What was ADDED is left out of scenarios and events where it says nothing new, so that a spec has
-    the bytes and the hash it had before."""
+    """JSON of a spec. What was ADDED is left out of scenarios, crowds and events where it says nothing new, so that a
+    spec has the bytes and the hash it had before."""
     tree = msgspec.to_builtins(spec, order="deterministic")
     for scenario in tree.get("scenarios", [tree]):
-        for part in (scenario, *scenario.get("events", ())):
+        for part in (scenario, scenario.get("crowd", {}), *scenario.get("events", ())):
             for field in [name for name, before in ADDED.items() if part.get(name) == before]:
                 del part[field]
     return msgspec.json.encode(tree)

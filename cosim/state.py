@@ -18,9 +18,9 @@ from cosim.geometry import Floats, Pose
 PERSON_RADIUS_M = 0.3
 """Radius of every pedestrian's collision cylinder."""
 
-Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone"]
+Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
 """What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand, reading a
-phone."""
+phone, sitting on a seat behind the place where it is."""
 
 
 def frozen(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -53,7 +53,8 @@ class People:
 
     strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
     shows, which follows the speed as one starts and stops (`cosim.gait`). Both are for pictures: nothing else reads
-    them. Background walkers have ids that start with "c", event pedestrians with "e".
+    them. Background walkers have ids that start with "c", event pedestrians with "e",
+    residents (`CrowdSpec.residents`) with "n".
     """
 
     ids: tuple[str, ...]

@@ -26,6 +26,7 @@ from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.directing import Direct, directed
 from scenarios.guests import Guests
+from scenarios.residents.director import among_residents
 from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.mapstore import map_net, read_map
@@ -89,6 +90,7 @@ def staged(
         if manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(chosen(choice))
         director = stack.enter_context(direct(scenario.id))
+        director = among_residents(director, scenario, street_map, world.ground, lambda: crowd.street.people)
         half_width_m = world.footprint_m[1] / 2
         footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
         free = shapely.buffer(footing, -half_width_m)

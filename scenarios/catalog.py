@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
+
 from cosim.errors import unknown
 from cosim.scenario import Scenario, Suite, read_suite
 
@@ -24,6 +26,16 @@ def suite(name: str) -> Suite:
     if name not in SUITES:
         raise unknown("suite", name, [*SUITES, "path/to/suite.json"])
     return read_suite(SUITES[name])
+
+
+def with_residents(whole: Suite, count: int) -> Suite:
+    """The suite with so many residents in each scenario: another suite, whose version says so.
+
+    Raises SpecError when there are too many.
+    """
+    replace = msgspec.structs.replace
+    scenarios = tuple(replace(s, crowd=replace(s.crowd, residents=count)) for s in whole.scenarios)
+    return replace(whole, scenarios=scenarios, version=f"{whole.version}-residents{count}")
 
 
 def chosen(

@@ -113,6 +113,8 @@ class Tally:
     def _where(self, tick: int, people: People, i: int, j: int) -> str:
         if "e" in (people.ids[i][0], people.ids[j][0]):
             return "with an event pedestrian"
+        if "n" in (people.ids[i][0], people.ids[j][0]):
+            return "with a resident"
         if (tick - max(self._since[people.ids[i]], self._since[people.ids[j]])) * self._tick_s < ENTERING_S:
             return "entering"
         x_m, y_m = (0.5 * (people.xy[i] + people.xy[j])).tolist()

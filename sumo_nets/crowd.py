@@ -188,8 +188,8 @@ class SumoCrowd(Crowd):
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
-        if len(present) != len(actors) or not all(name.startswith("e") for name in present):
-            raise EngineError(f"event pedestrians need unique ids that start with 'e': {[a.id for a in actors]}")
+        if len(present) != len(actors) or not all(name[0] in "en" for name in present):
+            raise EngineError(f"actors need unique ids that start with 'e' or 'n': {[a.id for a in actors]}")
         for name in sorted(self._actors.keys() - present):
             self._actors.pop(name).remove()
         for actor in actors:

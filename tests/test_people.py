@@ -13,13 +13,14 @@ import pytest
 from cosim.errors import EngineError
 from cosim.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
 from cosim.geometry import Floats
-from cosim.state import People
+from cosim.state import PERSON_RADIUS_M, People
 from physics.people.body import COATS, Body, body, far_body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
 from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.gaits import FRAMES, gait
+from physics.people.gestures import SEAT_M, SEATED_BACK_M
 from physics.people.looks import ALL, family_of, look
 from physics.people.parts import PARTS, part_colours, part_meshes, placed
 from physics.people.poses import poses
@@ -158,6 +159,22 @@ def test_the_stopping_hand_is_held_out() -> None:
         assert shown[:, 0].min() > 0.5 * f and shown[:, 2].min() > rest[INDEX["right_shoulder"], 2] - 0.06
         assert np.ptp(shown[:, 2]) > 3.0 * np.ptp(shown[:, 0])
         assert shown[:, 1].max() < -0.15 * f
+
+
+def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
+    """Of all families but children: hips behind the place on a seat, thighs level, feet at the place and flat."""
+    clips = own_clips()
+    for k, family in enumerate(FAMILIES):
+        if family == "child":
+            continue
+        matrix = clips.matrices[clips.gestures["sit"][k]].astype(float)
+        rest = skeleton(family).rest_m
+        at = {n: matrix[INDEX[n], :, :3] @ rest[INDEX[n]] + matrix[INDEX[n], :, 3] for n in JOINTS}
+        assert at["left_hip"][0] == pytest.approx(-SEATED_BACK_M, abs=0.03)
+        assert 0.0 < at["left_hip"][2] - SEAT_M < 0.12
+        assert at["left_knee"][0] - at["left_hip"][0] > 0.3 and abs(at["left_knee"][2] - at["left_hip"][2]) < 0.12
+        assert -PERSON_RADIUS_M < at["left_ankle"][0] < PERSON_RADIUS_M
+        assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
 
 
 def test_looks_hang_on_the_name_alone() -> None:

@@ -128,7 +128,14 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
     }
     names = ("route_s_m", "travelled_m", "person_m", "reset_s_m", "waits_at_red", "on_carriageway", "vehicles_braked")
     vectors = {name: np.ones(2) for name in names}
-    log = Log(tick_s=0.05, people_tick=np.ones(1, int), people_event=np.ones(1, bool), **arrays, **vectors)  # type: ignore[arg-type]
+    log = Log(
+        tick_s=0.05,
+        people_tick=np.ones(1, int),
+        people_event=np.ones(1, bool),
+        people_resident=np.ones(1, bool),
+        **arrays,
+        **vectors,
+    )  # type: ignore[arg-type]
     log.save(tmp_path / "t.npz")
     again = Log.load(tmp_path / "t.npz")
     assert again.tick_s == 0.05 and np.array_equal(again.pose, log.pose)

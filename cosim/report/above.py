@@ -34,6 +34,7 @@ TRACK: Final[Colour] = (20, 20, 20)
 BARRIER: Final[Colour] = (210, 30, 30)
 PERSON: Final[Colour] = (150, 120, 190)
 EVENT: Final[Colour] = (230, 120, 0)
+RESIDENT: Final[Colour] = (0, 140, 110)
 RESET: Final[Colour] = (120, 120, 120)
 FAILURES: Final[dict[str, Colour]] = {"collision": (220, 0, 0), "out_of_lane": (190, 0, 190), "freezing": (0, 140, 200)}
 
@@ -88,7 +89,8 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
         across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
         middle = np.array([barrier.x_m, barrier.y_m])
         sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
-    sheet.dot(log.people_xy[~log.people_event], PERSON, 0.15)
+    sheet.dot(log.people_xy[~(log.people_event | log.people_resident)], PERSON, 0.15)
+    sheet.dot(log.people_xy[log.people_resident], RESIDENT, 0.2)
     sheet.dot(log.people_xy[log.people_event], EVENT, 0.25)
     draw_track(sheet, log)
     for event in scenario.events:
@@ -101,7 +103,7 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
     sheet.text(scenario.start[:2], "start", TRACK)
     sheet.text(scenario.goal, "goal", TRACK)
     sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, 0.6)
-    legend(sheet.image, record, len(log) * log.tick_s)
+    legend(sheet.image, scenario, record, len(log) * log.tick_s)
     return sheet.image
 
 
@@ -136,7 +138,7 @@ def draw_track(sheet: Sheet, log: Log) -> None:
                 sheet.line(np.array(ends), RESET, 0.1)
 
 
-def legend(image: Image, record: Record, time_s: float) -> None:
+def legend(image: Image, scenario: Scenario, record: Record, time_s: float) -> None:
     """One line below the picture."""
     image[-LEGEND_PX:] = 255
     measures = record.measures
@@ -145,4 +147,6 @@ def legend(image: Image, record: Record, time_s: float) -> None:
         f"RC {measures.get('route_completion') or 0.0:.2f}  failures {measures.get('failures') or 0.0:.0f}   "
         "blue route, black track, red barriers, violet people, orange events"
     )
+    if scenario.crowd.residents:
+        words += ", green residents"
     cv2.putText(image, words, (8, len(image) - 11), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TRACK, 1, cv2.LINE_AA)

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.report.above import BARRIER, EVENT, PERSON, ROUTE, Image, Sheet, draw_streets
+from cosim.report.above import BARRIER, EVENT, PERSON, RESIDENT, ROUTE, Image, Sheet, draw_streets
 from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.streetmap import StreetMap
@@ -53,9 +53,10 @@ class Minimap:
             if crossing in street.signals:
                 sheet.line(line, WALK if street.signals[crossing].walk else RED, 0.5)
         people = street.people
-        event = np.array([name.startswith("e") for name in people.ids], dtype=bool)
-        sheet.dot(people.xy[~event], PERSON, 0.45)
-        sheet.dot(people.xy[event], EVENT, 0.55)
+        kinds = np.array([name[0] for name in people.ids], dtype=str)
+        sheet.dot(people.xy[(kinds != "e") & (kinds != "n")], PERSON, 0.45)
+        sheet.dot(people.xy[kinds == "n"], RESIDENT, 0.45)
+        sheet.dot(people.xy[kinds == "e"], EVENT, 0.55)
         nose = _box(robot.pose.xy, robot.pose.heading_rad, np.array([2.4, 1.6]))
         sheet.area(shapely.Polygon([(nose[0] + nose[1]) / 2, nose[2], nose[3]]), ROBOT)
         corners = sheet.px(robot.pose.xy + np.array([[-REACH_M, REACH_M], [REACH_M, -REACH_M]])) // 16

@@ -7,7 +7,6 @@ doors at even distances.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Sequence
 from typing import Final
 
@@ -19,12 +18,12 @@ from cosim.geometry import Floats
 from cosim.state import LABELS
 from cosim.streetmap import StreetMap
 from physics.buildings import Building, facade_meshes
+from physics.fronts import LEAST_M, face_of, style_of
 from physics.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
 from physics.gl.surfaces import Spot, Surfaces, SurfaceShaders
 from physics.mesh import Mesh
-from physics.placement import street_style
 from physics.textures.facade_canvas import BAY_M, STOREY_M
-from physics.textures.facades import DOORS, STREETS, VARIANTS, WALL_STYLES, WallStyle
+from physics.textures.facades import VARIANTS, WallStyle
 from physics.tiles import CURB_M
 
 _CORNER: Final = np.dtype(
@@ -40,8 +39,6 @@ _LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "i
 _LIT_SHARE: Final = 0.35
 _LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
 """Radiance of a lit window, in the units of physics.sky: some 60 candela per square metre."""
-_LEAST_M: Final = 2.2
-"""A narrower wall has no windows."""
 
 _VERTEX: Final = """
 in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
@@ -138,28 +135,17 @@ class WallBuffers:
         self._spot.release()
 
 
-def style_of(building: Building, street_map: StreetMap) -> WallStyle:
-    """What a building looks like: drawn by its name from those that its street has."""
-    strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
-    names = STREETS.get(street_style(strip.street_class) if strip is not None else "", STREETS[""])
-    return WALL_STYLES[names[zlib.crc32(f"style:{building.id}".encode()) % len(names)]]
-
-
 def _rows(
     building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
 ) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
     """Corners and triangles of a building's walls and roof."""
-    rng = np.random.default_rng(zlib.crc32(building.id.encode()))
+    face = face_of(building, style)
     layers, bays = surfaces.surfaces, surfaces.facades
-    wall = layers.index(str(rng.choice(style.walls)))
-    roof = layers.index(str(rng.choice(style.roofs)))
-    upper = bays.index(f"{rng.choice(style.uppers)}-0")
-    number = int(rng.integers(VARIANTS))
-    front = DOORS[str(rng.choice(style.fronts))]
-    fronts = [bays.index(f"{name}-{number}") for name in (front.between, front.door)]
-    doors = 16 * front.every + int(rng.integers(front.every))
-    colour = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
-    chance = rng.integers(0, 256, 2)
+    wall, roof = layers.index(face.wall), layers.index(face.roof)
+    upper = bays.index(f"{face.upper}-0")
+    fronts = [bays.index(f"{name}-{face.number}") for name in (face.front.between, face.front.door)]
+    doors = 16 * face.front.every + face.first_door
+    colour, chance = face.tint, face.chance
     street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
     found = []
     for facade, mesh in facade_meshes((building,)).items():
@@ -197,5 +183,5 @@ def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats,
         width = along.max()
         count = max(round(width / BAY_M), 1)
         spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
-        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= _LEAST_M and up.max() > 0.0 else 0
+        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= LEAST_M and up.max() > 0.0 else 0
     return spots, storeys

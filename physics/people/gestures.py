@@ -1,4 +1,4 @@
-"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand, reading a phone.
+"""What people do on the spot: standing, looking around, talking, queueing, the stopping hand, reading a phone, sitting.
 
 Each is a loop of `LOOP_S` seconds over the SMPL joints: feet on the ground, a body that breathes and shifts its weight.
 """
@@ -18,6 +18,11 @@ from physics.people.skeleton import INDEX, Skeleton, rodrigues
 
 FRAMES: Final = 64
 LOOP_S: Final = 8.0
+
+SEAT_M: Final = 0.475
+"""Height of the seat under who sits."""
+SEATED_BACK_M: Final = 0.59
+"""Who sits has the hips so far behind the point where it is: that is before the seat, where its legs are."""
 
 _PHASE: Final = 2.0 * np.pi * np.arange(FRAMES) / FRAMES
 
@@ -42,7 +47,10 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
     pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.012 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
     for side, (upper, fore, fingers, thumb) in arms.items():
         set_arm(turns, side, *(np.broadcast_to(v, (FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
-    _stand(turns, pelvis, skeleton, scale)
+    if name == "sit":
+        _sit(turns, pelvis, skeleton, scale)
+    else:
+        _stand(turns, pelvis, skeleton, scale)
     return turns, pelvis
 
 
@@ -52,6 +60,23 @@ def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> N
         ankle = skeleton.rest_m[INDEX[f"{side}_ankle"]]
         place = np.array([ankle[0] + 0.02 * left * scale, left * 0.105 * scale, ankle[2]])
         foot = about_z(np.full(FRAMES, left * np.deg2rad(9.0))) @ about_y(np.zeros(FRAMES))
+        set_leg(turns, pelvis, side, np.tile(place, (FRAMES, 1)), foot, np.zeros(FRAMES), skeleton)
+
+
+def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
+    """Set the hips on a seat behind the place, the shanks upright where the seat ends, both feet flat on the ground."""
+    rest, hip = skeleton.rest_m, INDEX["left_hip"]
+    hips_m = SEAT_M + 0.085 * scale
+    pelvis[:, 0] = -SEATED_BACK_M
+    pelvis[:, 1] *= 0.3
+    pelvis[:, 2] = hips_m - skeleton.offsets_m[hip][2]
+    for side, left in (("left", 1.0), ("right", -1.0)):
+        knee, ankle = (rest[INDEX[f"{side}_{part}"]] for part in ("knee", "ankle"))
+        thigh_m = float(np.linalg.norm(knee - rest[INDEX[f"{side}_hip"]]))
+        fall_m = min(max(hips_m - knee[2], 0.0), 0.8 * thigh_m)
+        ahead_m = np.sqrt(thigh_m**2 - fall_m**2) - SEATED_BACK_M + 0.03 * left * scale
+        place = np.array([ahead_m, left * 0.125 * scale, ankle[2]])
+        foot = about_z(np.full(FRAMES, left * np.deg2rad(10.0))) @ about_y(np.zeros(FRAMES))
         set_leg(turns, pelvis, side, np.tile(place, (FRAMES, 1)), foot, np.zeros(FRAMES), skeleton)
 
 
@@ -143,6 +168,18 @@ def _phoning(bends: Floats) -> dict[str, Arm]:
     }
 
 
+def _sitting(bends: Floats) -> dict[str, Arm]:
+    """Leans back a little with the hands on the thighs, and watches the street."""
+    _bend(bends, "pelvis", 0.0, -0.16, 0.0)
+    _bend(bends, "spine2", 0.0, 0.06, 0.0)
+    _bend(bends, "neck", 0.0, 0.06, 0.16 * np.sin(_PHASE))
+    _bend(bends, "head", 0.0, 0.04, 0.22 * np.sin(_PHASE))
+    return {
+        "left": _ways((0.30, 0.22, -1.0), (0.80, -0.14, -0.64), (1.0, -0.20, -0.30), (0.35, -0.75, 0.55)),
+        "right": _ways((0.34, -0.20, -1.0), (0.80, 0.18, -0.62), (1.0, 0.26, -0.28), (0.35, 0.75, 0.55)),
+    }
+
+
 GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxyType(
     {
         "stand": _standing,
@@ -151,6 +188,7 @@ GESTURES: Final[Mapping[str, Callable[[Floats], dict[str, Arm]]]] = MappingProxy
         "queue": _queueing,
         "stop": _stopping,
         "phone": _phoning,
+        "sit": _sitting,
     }
 )
 """What each turns of the body, and where it holds its arms."""

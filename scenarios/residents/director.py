@@ -1,0 +1,164 @@
+"""Residents beside the pedestrians of the events. A director around a director.
+
+So many are kept around the robot. They come and go out of its sight, and each draws from generators of its own, so
+what one does hangs on nothing but the scenario, its number, and what it meets.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.events import EventQuery, EventReply
+from cosim.geometry import Floats
+from cosim.ports import Director
+from cosim.scenario import Scenario
+from cosim.state import People
+from cosim.steering import NEAR_M, Neighbour
+from cosim.streetmap import StreetMap
+from physics.ground import Ground
+from scenarios.residents.graph import BehaviorGraph, behavior_graph
+from scenarios.residents.resident import (
+    SPEED_MPS,
+    Resident,
+    actor_of,
+    advanced,
+    arrived,
+    bound_for,
+    chosen,
+    drawn_spot,
+    drawn_waypoint,
+    wants_to_choose,
+)
+from sumo_nets.demand import CLEAR_M, SIGHT_M
+
+WITHIN_M: Final = 60.0
+"""Residents appear no farther from the robot."""
+GONE_M: Final = 70.0
+"""Beyond this they are gone."""
+ROLL_TICKS: Final = 10
+"""How often they come and go."""
+ROOM_M: Final = 1.5
+"""Nobody appears nearer to somebody."""
+SETTLED: Final = 0.5
+"""How likely somebody who appears is busy already, where there is something to do."""
+_MOST_NEIGHBOURS: Final = 6
+_KIND: Final = 0x8E51
+"""Tells the generators of residents from others of the same seed."""
+
+
+def among_residents(
+    director: Director, scenario: Scenario, street_map: StreetMap, ground: Ground, people: Callable[[], People]
+) -> Director:
+    """A director with the scenario's residents around it; itself where there are none."""
+    count = scenario.crowd.residents
+    if not count:
+        return director
+    graph = behavior_graph(street_map, ground, scenario.route, scenario.barriers)
+    return Residents(director, graph, count, scenario.seed, people)
+
+
+class Residents:
+    """Adds residents to another director's replies. people: those on the street now, the residents among them."""
+
+    def __init__(
+        self, director: Director, graph: BehaviorGraph, count: int, seed: int, people: Callable[[], People]
+    ) -> None:
+        self._director, self._graph, self._count, self._seed, self._people = director, graph, count, seed, people
+        self._here: dict[int, Resident] = {}
+        self._next = 0
+
+    @property
+    def here(self) -> tuple[Resident, ...]:
+        """Those who are there now."""
+        return tuple(self._here.values())
+
+    def react(self, query: EventQuery) -> EventReply:
+        """The director's reply, with the residents of this tick among its actors."""
+        reply = self._director.react(query)
+        people = self._people()
+        self._advance(query, people)
+        if query.tick % ROLL_TICKS == 0:
+            self._roll(query, people)
+        if not self._here:
+            return reply
+        return msgspec.structs.replace(reply, actors=(*reply.actors, *map(actor_of, self._here.values())))
+
+    def _advance(self, query: EventQuery, people: People) -> None:
+        robot = Neighbour(query.robot_x_m, query.robot_y_m, *_velocity(query.robot_v_mps, query.robot_heading_rad))
+        for number, resident in list(self._here.items()):
+            if wants_to_choose(resident, query):
+                taken = {one.goal for one in self._here.values() if one.number != number}
+                resident = chosen(resident, self._graph, self._rng(number, resident.choices), taken)
+            self._here[number] = resident
+        around = _around([one for one in self._here.values() if one.phase == "walking"], people)
+        for number, resident in list(self._here.items()):
+            self._here[number] = advanced(resident, self._graph, query, (robot, *around.get(number, ())))
+
+    def _roll(self, query: EventQuery, people: People) -> None:
+        robot = np.array([query.robot_x_m, query.robot_y_m])
+        for number, one in list(self._here.items()):
+            if np.hypot(one.x_m - robot[0], one.y_m - robot[1]) > GONE_M:
+                del self._here[number]
+        if len(self._here) >= self._count or not len(self._graph):
+            return
+        away = np.hypot(*(self._graph.xy - robot).T)
+        nearest = SIGHT_M if query.tick else CLEAR_M
+        ring = (away >= nearest) & (away <= WITHIN_M)
+        ring[[one.goal for one in self._here.values()]] = False
+        for _ in range(self._count - len(self._here)):
+            others = np.array([*people.xy.tolist(), *((one.x_m, one.y_m) for one in self._here.values())])
+            resident = self._appearing(ring, others.reshape(-1, 2), query)
+            if resident is None:
+                return
+            ring[resident.goal] = False
+            self._here[resident.number] = resident
+
+    def _appearing(self, ring: NDArray[np.bool_], others: Floats, query: EventQuery) -> Resident | None:
+        """Somebody new at one of the nodes (N,) bool, busy there or on the way; None where others leave no room."""
+        number, graph = self._next, self._graph
+        rng = self._rng(number, 0)
+        self._next += 1
+        node = drawn_spot(graph, ring, rng) if rng.random() < SETTLED else None
+        settled = node is not None
+        if node is None:
+            node = drawn_waypoint(graph, ring, rng, ())
+        if node is None or (np.hypot(*(others - graph.xy[node]).T) < ROOM_M).any():
+            return None
+        x, y = graph.xy[node].tolist()
+        spot = graph.spot(node)
+        heading = float(rng.uniform(-np.pi, np.pi)) if spot is None else spot.heading_rad
+        one = Resident(number, x, y, heading, float(rng.uniform(*SPEED_MPS)), node, choices=1)
+        if settled:
+            one = arrived(bound_for(one, graph, node, rng), graph)
+            return one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
+        return chosen(one, graph, rng, {other.goal for other in self._here.values()})
+
+    def _rng(self, number: int, choice: int) -> np.random.Generator:
+        return np.random.default_rng([self._seed, _KIND, number, choice])
+
+
+def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neighbour]]:
+    """The nearest people around each resident that walks, by its number."""
+    if not walking or not len(people):
+        return {one.number: [] for one in walking}
+    at = np.array([(one.x_m, one.y_m) for one in walking])
+    apart = people.xy[None] - at[:, None]
+    square = np.einsum("ijk,ijk->ij", apart, apart)
+    found: dict[int, list[tuple[float, Neighbour]]] = {one.number: [] for one in walking}
+    for k, i in np.argwhere(square < NEAR_M**2).tolist():
+        if people.ids[i] != walking[k].name:
+            moving = _velocity(float(people.speed[i]), float(people.heading[i]))
+            x, y = people.xy[i].tolist()
+            one = Neighbour(x, y, *moving, 0.5 if people.ids[i][0] == "n" else 1.0)
+            found[walking[k].number].append((float(square[k, i]), one))
+    return {number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]] for number, near in found.items()}
+
+
+def _velocity(speed_mps: float, heading_rad: float) -> tuple[float, float]:
+    return speed_mps * math.cos(heading_rad), speed_mps * math.sin(heading_rad)
