@@ -25,7 +25,7 @@ from rich.table import Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
-from cosim.cli_crowd import counterfactual
+from cosim.cli_crowd import compare_one
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
@@ -45,7 +45,7 @@ app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n
     look
 )
 app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
-app.command(epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(counterfactual)
+app.command("counterfactual", epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(compare_one)
 app.command(
     epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
     "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`"
@@ -72,7 +72,8 @@ err = Console(stderr=True)
     "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
-    "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`"
+    "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`  \n"
+    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`"
 )
 def run(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
@@ -102,6 +103,9 @@ def run(
     director_wait: Annotated[
         float, typer.Option(min=0.1, max=LONGEST_WAIT_S, help="Seconds to wait for it; then the episode has crashed.")
     ] = 60.0,
+    counterfactual: Annotated[
+        bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
+    ] = False,
 ) -> None:
     """Run a suite with a policy and print its table."""
     from bridge import keys
@@ -140,6 +144,7 @@ def run(
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
         renderer=renderer_of(drawn_by) if manifest.camera is not None else NO_RENDERER,
+        counterfactual=counterfactual,
     )
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")

@@ -102,19 +102,18 @@ def _add_shares(table: Table, shares: tuple[tuple[str, str, str], ...], counts: 
         table.add_row(name, f"{count:.2f}", f"{of:.0f} {whole}", share, target)
 
 
-def counterfactual(
+def compare_one(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
     episode: Annotated[str, typer.Argument(help="One of its episodes.")],
 ) -> None:
     """Replay an episode, simulate its street again without the robot, and print whom the robot delayed by how much."""
     from cosim.delay import NEAR_M
-    from scenarios.counterfactual import counterfactual as compare
-    from scenarios.replay import check, recorded
+    from scenarios.replay import check, compared, recorded
 
     with err.status(f"{episode}, with and without its robot ..."):
         told = recorded(folder, episode)
-        found = compare(told)
-    check(folder, told, found.state_hash)
+        state_hash, found = compared(told)
+    check(folder, told, state_hash)
     table = Table(episode, f"delay, s: within {NEAR_M:g} m", "of", "delay, s: all", "of", "not comparable")
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
         near, everybody = (f"{delay.near_s:+.1f}", str(delay.near)), (f"{delay.delay_s:+.1f}", str(delay.compared))

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from cosim.clock import Clock
-from cosim.metrics import METRICS
+from cosim.metrics import COUNTERFACTUAL, METRICS
 from cosim.record import Record
 from cosim.results import interval_of, summary_of
 from cosim.scenario import Scenario, read_suite
@@ -46,12 +46,24 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
             interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
             means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
         out.print(means)
+    print_delays(out, table)
     crashed = table[table["status"] == "crashed"]
     invalid = table[table["status"] == "invalid"]
     counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
     out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
     for _, row in pd.concat([crashed, invalid]).iterrows():
         out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_delays(out: Console, table: pd.DataFrame) -> None:
+    """What the robot cost others, per episode, in a run that was asked to compare; nothing in any other."""
+    if not set(COUNTERFACTUAL) <= set(table.columns):
+        return
+    shown = Table("against the same street without the robot", "per episode", "95 % interval", "n", box=box.SIMPLE_HEAD)
+    for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
+        interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+        shown.add_row(str(name), _cell(row["mean"]), interval, f"{row['n']:.0f}")
+    out.print(shown)
 
 
 def print_episode(out: Console, record: Record) -> None:
@@ -67,6 +79,9 @@ def print_episode(out: Console, record: Record) -> None:
     table = Table("metric", "value", "unit")
     for name, metric in METRICS.items():
         table.add_row(name, _cell(record.measures.get(name)), metric.unit)
+    for name, unit in COUNTERFACTUAL.items():
+        if name in record.measures:
+            table.add_row(name, _cell(record.measures[name]), unit)
     out.print(table)
 
 

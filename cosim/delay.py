@@ -8,6 +8,7 @@ spreads: far from the robot the two streets differ by chance, so the sum over th
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -35,21 +36,31 @@ class Delay(NamedTuple):
 
 
 class Tracks:
-    """Where everybody of one kind was, tick by tick. ids that start with another letter than `kind` are left out."""
+    """Where everybody of one kind was, tick by tick, from when it was first seen until it was first missed.
+
+    ids that start with another letter than `kind` are left out.
+    """
 
     def __init__(self, kind: str) -> None:
         self._kind = kind
         self._tick = 0
+        self._xy: dict[str, array[float]] = {}
         self.began: dict[str, int] = {}
-        self.ways: dict[str, list[tuple[float, float]]] = {}
 
     def add(self, bodies: People | Vehicles) -> None:
         """The next tick."""
         for name, (x_m, y_m) in zip(bodies.ids, bodies.xy.tolist(), strict=True):
-            if name.startswith(self._kind):
-                self.began.setdefault(name, self._tick)
-                self.ways.setdefault(name, []).append((x_m, y_m))
+            if not name.startswith(self._kind):
+                continue
+            began = self.began.setdefault(name, self._tick)
+            way = self._xy.setdefault(name, array("d"))
+            if len(way) == 2 * (self._tick - began):
+                way.extend((x_m, y_m))
         self._tick += 1
+
+    def way(self, name: str) -> Floats:
+        """(N, 2) m: where somebody was; nowhere for one who never came."""
+        return np.array(self._xy.get(name, ()), dtype=float).reshape(-1, 2)
 
 
 def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Tracks, tick_s: float) -> Delay:
@@ -57,9 +68,10 @@ def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Trac
     at = np.array(robot, dtype=float).reshape(-1, 2)
     delay_s = near_s = 0.0
     compared = near = unmatched = 0
-    for name in sorted(present.ways):
-        mine, other = np.array(present.ways[name]), np.array(absent.ways.get(name, [(np.inf, np.inf)]))
-        same = present.began[name] == absent.began.get(name) and np.hypot(*(mine[0] - other[0])) < SAME_PLACE_M
+    for name in sorted(present.began):
+        mine, other = present.way(name), absent.way(name)
+        first = present.began[name]
+        same = first == absent.began.get(name) and np.hypot(*(mine[0] - other[0])) < SAME_PLACE_M
         if not same:
             unmatched += 1
             continue
@@ -69,7 +81,6 @@ def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Trac
         if not moving.any():
             continue
         late_s = float((steps_other.sum() - steps_mine.sum()) / steps_other[moving].mean()) * tick_s
-        first = present.began[name]
         gap = mine[:shared] - at[first : first + shared]
         is_near = bool((np.hypot(gap[:, 0], gap[:, 1]) < NEAR_M).any())
         delay_s, compared = delay_s + late_s, compared + 1

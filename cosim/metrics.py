@@ -201,6 +201,12 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
     }
 )
 
+COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
+    {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}
+)
+"""Name -> unit of what is measured against the same street without the robot (`cosim.delay`), when that is asked for:
+delay of those that came near the robot, summed, and how many they were. No part of any other episode."""
+
 
 def measure(episode: Episode) -> dict[str, float | None]:
     """Every metric of an episode."""

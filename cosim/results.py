@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from cosim import metrics
-from cosim.metrics import METRICS
+from cosim.metrics import COUNTERFACTUAL, METRICS
 from cosim.record import Record
 
 KEYS: tuple[str, ...] = (
@@ -30,13 +30,15 @@ def row_of(record: Record) -> dict[str, Any]:
     row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {"done": record.measures, "crashed": WORST, "invalid": {}}
     measures = counted[record.status]
-    return row | {name: measures.get(name) for name in METRICS}
+    asked = {name: measures[name] for name in COUNTERFACTUAL if name in measures}
+    return row | {name: measures.get(name) for name in METRICS} | asked
 
 
 def table_of(records: Iterable[Record]) -> pd.DataFrame:
     """One row per episode, sorted by scenario id, whatever order they ended in."""
-    columns = [*KEYS, "metric_schema", "versions", *METRICS]
     rows = sorted((row_of(record) for record in records), key=lambda row: str(row["scenario"]))
+    asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
+    columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
     return pd.DataFrame(rows, columns=columns)
 
 

@@ -34,7 +34,8 @@ UNFINISHED = {"episodes", "logs", "scenarios.json", "run.json.part"}
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures."""
+    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
+    counterfactual: whether each episode is compared with its street without the robot."""
 
     suite: str
     suite_version: str
@@ -45,6 +46,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     scenarios: tuple[str, ...]
     versions: dict[str, str]
     renderer: str = "unknown"
+    counterfactual: bool = False
     schema: int = 1
 
 
@@ -80,7 +82,17 @@ class RunFolder:
     def resume(cls, path: Path, spec: RunSpec) -> RunFolder:
         """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run."""
         found = read_spec(path)
-        for field in ("suite", "suite_hash", "policy", "policy_version", "scenarios", "versions", "renderer"):
+        same = (
+            "suite",
+            "suite_hash",
+            "policy",
+            "policy_version",
+            "scenarios",
+            "versions",
+            "renderer",
+            "counterfactual",
+        )
+        for field in same:
             mine, theirs = getattr(spec, field), getattr(found, field)
             if mine != theirs:
                 raise RunError(

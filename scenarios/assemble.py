@@ -29,6 +29,7 @@ from scenarios.guests import Guests
 from scenarios.residents.director import among_residents
 from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
+from sumo_nets.entrances import Entrances
 from sumo_nets.mapstore import map_net, read_map
 from sumo_nets.store import city_net
 
@@ -43,7 +44,8 @@ FRONTAGE_M = 2.0
 @dataclass(frozen=True, slots=True)
 class Stage:
     """A scenario ready to run. area: where the robot may be, for the referee. renderer: what draws for the policy.
-    eyes: makes further cameras. guests: takes injected pedestrians in. roadway: watches the robot among vehicles."""
+    eyes: makes further cameras. guests: takes injected pedestrians in. roadway: watches the robot among vehicles.
+    entrances: who comes and goes in the street."""
 
     parts: Parts
     area: WalkableArea
@@ -52,6 +54,7 @@ class Stage:
     eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
     guests: Guests
     roadway: Roadway
+    entrances: Entrances
 
 
 @contextmanager
@@ -96,8 +99,9 @@ def staged(
         free = shapely.buffer(footing, -half_width_m)
         shapely.prepare(free)
         guests = Guests(director, clock.tick_ms, partial(on_map, street_map), script)
+        roadway = Roadway(street_map, clock.tick_s)
         parts = Parts(world, crowd, guests, policy, camera, Limits(), free)
-        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests, Roadway(street_map, clock.tick_s))
+        yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests, roadway, crowd.entrances)
 
 
 def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:

@@ -1,7 +1,7 @@
-"""A recorded episode beside the same street without its robot: who was delayed, and by how much.
+"""An episode beside the same street without its robot: who was delayed, and by how much.
 
-The episode is replayed; then its street is simulated again from the same seed, with the same event pedestrians and
-guests where they were, around the same moving point, but with nothing there.
+When the episode is over its street is simulated again from the same seed: the same people and vehicles come and go at
+the same moments, the same event pedestrians and guests are where they were, but nothing is where the robot was.
 """
 
 from __future__ import annotations
@@ -12,41 +12,51 @@ from cosim.clock import Clock
 from cosim.delay import Delay, Tracks, delay_of
 from cosim.events import EventReply
 from cosim.referee import Verdict
+from cosim.scenario import Scenario
 from cosim.state import RobotState
 from cosim.step import Step
-from cosim.streetmap import Port
 from scenarios.assemble import place
-from scenarios.replay import Recorded, replayed
-from sumo_nets.crowd import SumoCrowd
+from sumo_nets.again import StreetAgain
+from sumo_nets.entrances import Entrances
 
 
 class Compared(NamedTuple):
-    """What the robot cost people and vehicles; state_hash: of the replayed episode."""
+    """What the robot cost people and vehicles."""
 
     people: Delay
     vehicles: Delay
-    state_hash: str
+
+    @property
+    def measures(self) -> dict[str, float | None]:
+        """As measures of a record: delays over those that came near the robot, absent where nobody did."""
+        measures: dict[str, float | None] = {}
+        for kind, delay in (("people", self.people), ("vehicles", self.vehicles)):
+            measures[f"{kind}_delay_s"] = delay.near_s if delay.near else None
+            measures[f"{kind}_compared"] = float(delay.near)
+        return measures
 
 
-def counterfactual(told: Recorded) -> Compared:
-    """Compare an episode with the same street without the robot."""
-    moments: list[tuple[RobotState, EventReply]] = []
-    present = Tracks("c"), Tracks("v")
+class Beside:
+    """Watches an episode; once it is over, compares it with the street without its robot."""
 
-    def watch(step: Step, verdict: Verdict) -> None:
-        moments.append((step.robot, step.events))
-        present[0].add(step.street_after.people)
-        present[1].add(step.street_after.vehicles)
+    def __init__(self) -> None:
+        self._moments: list[tuple[RobotState, EventReply]] = []
+        self._present = Tracks("c"), Tracks("v")
 
-    state_hash = replayed(told, watch)
-    scenario, absent = told.scenario, (Tracks("c"), Tracks("v"))
-    net_path, street_map = place(scenario.place)
-    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-    with SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2]) as crowd:
-        for robot, reply in moments:
-            street = crowd.step(robot, reply, absent=True)
-            absent[0].add(street.people)
-            absent[1].add(street.vehicles)
-    robot_xy = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in moments]
-    people, vehicles = (delay_of(robot_xy, a, b, Clock().tick_s) for a, b in zip(present, absent, strict=True))
-    return Compared(people, vehicles, state_hash)
+    def watch(self, step: Step, verdict: Verdict) -> None:
+        """The next tick of the episode."""
+        self._moments.append((step.robot, step.events))
+        self._present[0].add(step.street_after.people)
+        self._present[1].add(step.street_after.vehicles)
+
+    def compared(self, scenario: Scenario, entrances: Entrances) -> Compared:
+        """entrances: of the episode. No SUMO may be running in this process."""
+        net_path, street_map = place(scenario.place)
+        absent = Tracks("c"), Tracks("v")
+        with StreetAgain(net_path, street_map, scenario, entrances) as crowd:
+            for robot, reply in self._moments:
+                street = crowd.step(robot, reply, absent=True)
+                absent[0].add(street.people)
+                absent[1].add(street.vehicles)
+        at = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in self._moments]
+        return Compared(*(delay_of(at, a, b, Clock().tick_s) for a, b in zip(self._present, absent, strict=True)))

@@ -65,7 +65,7 @@ class Tally:
         self._tick = -1
         self._since: dict[str, int] = {}
         self._red_s: dict[str, float] = {}
-        self._on: dict[str, str] = {}
+        self._on: set[str] = set()
         self._over: set[tuple[str, str]] = set()
         self._boxes: dict[str, tuple[Floats, Floats]] = {}
 
@@ -157,7 +157,7 @@ class Tally:
         """Entries of people, tick by tick; vehicles on crossings at walk, now and then."""
         people, vehicles = street.people, street.vehicles
         crowd = np.array([name.startswith("c") for name in people.ids], dtype=bool)
-        now: dict[str, str] = {}
+        now: set[str] = set()
         over: set[tuple[str, str]] = set()
         looks = street.tick % EVERY_TICKS == 0
         for crossing, signal in street.signals.items():
@@ -165,9 +165,10 @@ class Tally:
             inside = crowd & (point_gaps(middle, half - (INTO_M, 0.0), people.xy) <= 0.0)
             for i in np.flatnonzero(inside).tolist():
                 name = people.ids[i]
-                now[name] = crossing
-                if self._on.get(name) != crossing and street.tick > self._since[name]:
+                # Crossings of one junction may overlap: who walks on one of them does not enter another.
+                if name not in now and name not in self._on and street.tick > self._since[name]:
                     self._entered(name, crossing, self._red_s[crossing], street.tick)
+                now.add(name)
             if looks and signal.walk and len(vehicles):
                 boxes = np.column_stack([vehicles.xy, vehicles.heading])
                 hit = boxes_overlap(middle, half, boxes, vehicles.size / 2) & (vehicles.speed > ROLLING_MPS)

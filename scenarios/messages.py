@@ -16,7 +16,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames.
 
     camera: what draws the pictures, the same for a whole run. outside: the director, when the episode has none of its
-    own.
+    own. counterfactual: see `scenarios.run.episode`.
     """
 
     scenario: Scenario
@@ -26,6 +26,7 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     camera: Literal["gl", "bullet", "bullet-egl"] = "bullet"
     live: Live | None = None
     outside: Outside | None = None
+    counterfactual: bool = False
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):

@@ -116,7 +116,10 @@ class _Pool:
         (Path(target) / "record.json").unlink(missing_ok=True)
         try:
             suite_hash = self._folder.spec.suite_hash
-            job = Job(scenario, suite_hash, target, self._frames_every_s, self._camera, self._live, self._outside)
+            beside = self._folder.spec.counterfactual
+            job = Job(
+                scenario, suite_hash, target, self._frames_every_s, self._camera, self._live, self._outside, beside
+            )
             idle.pipe.send_bytes(encode(job))
         except BrokenPipeError:
             idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out

@@ -11,7 +11,9 @@ from cosim.record import Log, Record, begun
 from cosim.runfolder import read_records
 from cosim.scenario import Scenario, read_suite
 from scenarios.assemble import staged
+from scenarios.counterfactual import Beside, Compared
 from scenarios.run import Watch, drive
+from sumo_nets.entrances import Entrances
 
 
 class Recorded(NamedTuple):
@@ -37,10 +39,21 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
 
 def replayed(told: Recorded, *watches: Watch) -> str:
     """Run it again; the state hash that comes out."""
+    return _again(told, *watches)[0]
+
+
+def compared(told: Recorded) -> tuple[str, Compared]:
+    """Run it again, then its street without the robot; the state hash, and what the robot cost the others."""
+    beside = Beside()
+    state_hash, entrances = _again(told, beside.watch)
+    return state_hash, beside.compared(told.scenario, entrances)
+
+
+def _again(told: Recorded, *watches: Watch) -> tuple[str, Entrances]:
     driver = Replay(told.log.command)
     with staged(told.scenario, driver, script=told.record.injections) as stage:
         record, _ = drive(begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, *watches)
-    return record.state_hash
+    return record.state_hash, stage.entrances
 
 
 def check(folder: Path, told: Recorded, state_hash: str) -> None:

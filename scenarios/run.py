@@ -23,6 +23,7 @@ from cosim.step import Step
 from cosim.witness import Witness, unwitnessed
 from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
+from scenarios.counterfactual import Beside
 from scenarios.directing import Direct, directed
 from scenarios.on_air import OnAir
 
@@ -31,7 +32,8 @@ Watch = Callable[[Step, Verdict], None]
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of an episode. log: None if it crashed before the first tick; traceback: of a crash."""
+    """What came out of an episode. log: None if it crashed before the first tick; traceback: of a crash, or of a
+    comparison that failed."""
 
     record: Record
     log: Log | None
@@ -47,28 +49,39 @@ def episode(
     watch: Watch | None = None,
     live: Live | None = None,
     direct: Direct = directed,
+    counterfactual: bool = False,
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
 
-    live: where it is on the air meanwhile. direct: gives the director of its event pedestrians.
+    live: where it is on the air meanwhile. direct: gives the director of its event pedestrians. counterfactual: whether
+    it is compared with its street without the robot.
     """
     began = time.perf_counter()
     record = begun(scenario, policy.manifest, suite_hash)
+    beside, trouble = Beside(), ""
     try:
         with staged(scenario, policy, camera, direct=direct) as stage:
             record = replaced(record, renderer=stage.renderer)
             first_tick_s = time.perf_counter() - began
             with ExitStack() as air:
                 watches = [watch] if watch is not None else []
+                watches += [beside.watch] if counterfactual else []
                 if live is not None:
                     watches.append(air.enter_context(OnAir(live, scenario, stage.guests)).tell)
                 record, log = drive(record, scenario, stage, *watches)
     except Exception as error:  # noqa: BLE001  the one place where a failing episode is turned into its record
         reason = str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
         return Outcome(replaced(record, status="crashed", reason=reason), None, traceback.format_exc())
+    if counterfactual:
+        try:
+            measures = record.measures | beside.compared(scenario, stage.entrances).measures
+            record = replaced(record, measures=measures)
+        except CosimError as error:
+            trouble = traceback.format_exc()
+            record = replaced(record, reason=f"the street without the robot: {error}")
     wall_s = time.perf_counter() - began
     clock = {"wall_s": wall_s, "setup_s": first_tick_s}
-    return Outcome(replaced(record, clock=clock), log)
+    return Outcome(replaced(record, clock=clock), log, trouble)
 
 
 def drive(record: Record, scenario: Scenario, stage: Stage, *watches: Watch) -> tuple[Record, Log]:

@@ -58,6 +58,7 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
             watch=watch,
             live=job.live,
             direct=director_of(job, pipe),
+            counterfactual=job.counterfactual,
         )
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)

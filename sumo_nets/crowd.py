@@ -29,6 +29,7 @@ from cosim.scenario import CrowdSpec
 from cosim.state import People, RobotState, Street, Vehicles
 from cosim.streetmap import Port, StreetMap
 from sumo_nets.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
+from sumo_nets.entrances import Entrances, Kept
 from sumo_nets.kerbs import Kerbs
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
@@ -47,6 +48,7 @@ SIGNAL_CLOCK_S = 3600
 """The signals' clocks start somewhere in this span, drawn from the seed."""
 
 STANDING_MPS = 0.1
+PEDESTRIANS, DRIVERS = "pedestrians", "drivers"
 NOWHERE_M = -1e8
 """Who has not set out yet is beyond this."""
 
@@ -64,9 +66,11 @@ class SumoCrowd(Crowd):
     closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
     footprint_m: its length and width.
     Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
+    entrances: who has come and gone since it was entered.
     """
 
     _running: ClassVar[SumoCrowd | None] = None
+    entrances: Entrances
 
     def __init__(
         self,
@@ -161,8 +165,7 @@ class SumoCrowd(Crowd):
         self._walks = Walks(libsumo, self._map)
         self._signals = Signals(libsumo, self._map)
         self._kerbs = Kerbs(self._map)
-        self._pedestrians = Pedestrians(libsumo, self._map, self._spec, rng_persons, self._closed)
-        self._drivers = Drivers(libsumo, self._map, self._spec, rng_vehicles)
+        self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(libsumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
@@ -176,6 +179,15 @@ class SumoCrowd(Crowd):
         self._pedestrians.fill(x_m, y_m)
         libsumo.simulationStep()
         self._street = self._read(0, x_m, y_m, (), None)
+
+    def _demand(
+        self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
+    ) -> tuple[Pedestrians, Drivers]:
+        """Those who let people and vehicles in and out; what they do is kept in `entrances`."""
+        self.entrances = Entrances()
+        on_foot, driving = (Kept(libsumo, self.entrances, whose) for whose in (PEDESTRIANS, DRIVERS))
+        people = Pedestrians(on_foot, self._map, self._spec, rng_persons, self._closed)
+        return people, Drivers(driving, self._map, self._spec, rng_vehicles)
 
     def _watch(self, x_m: float, y_m: float) -> None:
         """One subscription each to the persons and to the vehicles around a point that follows the robot."""

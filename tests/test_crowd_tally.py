@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -14,6 +15,7 @@ from scenarios.crowd_tally import Tally
 
 LINE = np.array([[0.0, 0.0], [8.0, 0.0]])
 CROSSING = Strip(":j_c0", "crossing", LINE, 4.0, shapely.box(0.0, -2.0, 8.0, 2.0), (None, None), signalised=True)
+SLANT = shapely.LineString([[4.0, -6.0], [12.0, 6.0]]).buffer(2.0, cap_style="flat")
 MAP = StreetMap("m", (0.0, 0.0, 9.0, 9.0), {":j_c0": CROSSING}, {}, {}, {})
 
 
@@ -44,6 +46,19 @@ def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
     assert tally.counts["persons entered within a second of red"] == 1
     assert tally.counts["persons entered at red"] == 1
     assert tally.crossings == {":j_c0"}
+
+
+def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> None:
+    """A slanting crossing, red all the time, is walked through by somebody who entered the other one at green."""
+    slanting = Strip(
+        ":j_c1", "crossing", np.array([[4.0, -6.0], [12.0, 6.0]]), 4.0, SLANT, (None, None), signalised=True
+    )
+    tally = Tally(StreetMap("m", MAP.bounds, {**MAP.strips, ":j_c1": slanting}, {}, {}, {}), 0.05, [])
+    for tick in range(150):
+        seen = street(tick, [(-1.0 + 0.06 * tick, 0.0)])
+        tally.see(replace(seen, signals=MappingProxyType({**seen.signals, ":j_c1": Signal(False)})))
+    assert tally.counts["persons entered signalised crossings"] == 1
+    assert tally.counts["persons entered at red"] == 0
 
 
 def test_people_in_things_and_vehicles_are_seen() -> None:

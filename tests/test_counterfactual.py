@@ -1,0 +1,112 @@
+"""An episode beside the same street without its robot, with the real engines."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from cosim.delay import Tracks, delay_of
+from cosim.events import EventReply
+from cosim.geometry import Pose
+from cosim.policies.load import load_policy
+from cosim.record import Record
+from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from cosim.state import RobotState, Street
+from cosim.streetmap import Port
+from cosim.walks import WalkGraph
+from scenarios.assemble import place
+from scenarios.crossings import build_all
+from scenarios.run import episode
+from sumo_nets.again import StreetAgain
+from sumo_nets.crowd import SumoCrowd
+from sumo_nets.entrances import Entrances
+
+pytestmark = pytest.mark.engine
+
+SMALL = City(seed=5, size_m=500.0)
+OPEN: frozenset[Port] = frozenset()
+TICKS = 600
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """A way over a crossing."""
+    _, street_map = place(SMALL)
+    return build_all(SMALL, street_map, WalkGraph(street_map), 3, 1)[0]
+
+
+def streets(scenario: Scenario, robot: RobotState, absent: bool) -> tuple[list[Street], Entrances]:
+    """Half a minute around a robot that stands, or does not, where it is put."""
+    net, street_map = place(scenario.place)
+    with SumoCrowd(net, street_map, scenario.crowd, scenario.seed, OPEN, scenario.start[:2]) as crowd:
+        return [crowd.step(robot, nobody(tick), absent=absent) for tick in range(TICKS)], crowd.entrances
+
+
+def once_more(scenario: Scenario, robot: RobotState, entrances: Entrances) -> list[Street]:
+    net, street_map = place(scenario.place)
+    with StreetAgain(net, street_map, scenario, entrances) as crowd:
+        return [crowd.step(robot, nobody(tick), absent=True) for tick in range(TICKS)]
+
+
+def nobody(tick: int) -> EventReply:
+    return EventReply(episode="t", tick=tick, states=(), actors=())
+
+
+def test_a_street_without_a_robot_is_itself_when_it_is_simulated_again(scenario: Scenario) -> None:
+    """Nobody is there either time: the same people and vehicles at the same places, to the last bit."""
+    robot = RobotState(Pose(*scenario.start))
+    before, entrances = streets(scenario, robot, absent=True)
+    for a, b in zip(before, once_more(scenario, robot, entrances), strict=True):
+        assert (a.people.ids, a.vehicles.ids) == (b.people.ids, b.vehicles.ids)
+        assert a.people.xy.tobytes() == b.people.xy.tobytes()
+        assert a.vehicles.xy.tobytes() == b.vehicles.xy.tobytes()
+
+
+def test_everybody_who_came_to_the_robot_comes_without_it_too(scenario: Scenario) -> None:
+    """Around a robot that stands in the middle of a crossing vehicles are held up, and all can be compared."""
+    crossing = scenario.crossings[0]
+    middle = scenario.route_line.at(0.5 * (crossing.enter_s_m + crossing.leave_s_m))
+    busy = Scenario(**{f: getattr(scenario, f) for f in scenario.__struct_fields__} | {"crowd": CrowdSpec(vehicles=40)})
+    robot = RobotState(middle)
+    with_it, entrances = streets(busy, robot, absent=False)
+    without = once_more(busy, robot, entrances)
+    present, absent = Tracks("v"), Tracks("v")
+    people, same_people = Tracks("c"), Tracks("c")
+    for a, b in zip(with_it, without, strict=True):
+        present.add(a.vehicles)
+        absent.add(b.vehicles)
+        people.add(a.people)
+        same_people.add(b.people)
+    at = [middle[:2]] * TICKS
+    cars, walkers = delay_of(at, present, absent, 0.05), delay_of(at, people, same_people, 0.05)
+    assert (cars.unmatched, walkers.unmatched) == (0, 0)
+    assert cars.compared > 10 and walkers.compared > 30
+    assert cars.delay_s > 5.0
+
+
+def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, tmp_path: Path) -> None:
+    """The delays are in row and record of the run that asked; nothing else differs from the run that did not."""
+    write_suite(Suite(name="one", version="1", scenarios=(scenario,)), tmp_path / "one.json")
+    words = ["run", "one.json", "--policy", "orca", "--out", "asked", "--counterfactual"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "against the same street without the robot" in done.stdout
+    row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
+    plain = episode(scenario, load_policy("orca"), suite_hash=str(row["suite_hash"])).record
+    asked = Record.load(tmp_path / "asked" / "episodes" / scenario.id / "record.json")
+    names = ["people_delay_s", "people_compared", "vehicles_delay_s", "vehicles_compared"]
+    assert asked.state_hash == plain.state_hash
+    assert {n: v for n, v in asked.measures.items() if n not in names} == plain.measures
+    assert row["people_compared"] == asked.measures["people_compared"] and row["people_compared"] > 0
+    assert not set(names) & set(plain.measures)
