@@ -66,7 +66,7 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
 class Walker(msgspec.Struct, frozen=True, kw_only=True):
     """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
 
-    blocked_ticks: how long it has stood against the robot.
+    blocked_ticks: how long it has stood against the robot. vx_mps, vy_mps: of its last step.
     """
 
     x_m: float
@@ -75,6 +75,8 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
     aim_rad: float | None = None
     pace_mps: float | None = None
     blocked_ticks: int = 0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
 
 
 class EventState(msgspec.Struct, frozen=True, kw_only=True):
@@ -102,10 +104,21 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
     doing: Doing
 
 
+class Bystander(msgspec.Struct, frozen=True, array_like=True):
+    """Somebody who is not of an event: id, place and velocity. Ids of guests start with "e", of residents with "n"."""
+
+    id: str
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+
+
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
     route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
+    bystanders: who is near the people that the director moves, see `cosim.bystanders`.
     """
 
     episode: str
@@ -121,6 +134,7 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     robot_width_m: float
     events: tuple[Event, ...]
     states: tuple[EventState, ...] = ()
+    bystanders: tuple[Bystander, ...] = ()
 
 
 class EventReply(msgspec.Struct, frozen=True, kw_only=True):

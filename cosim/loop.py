@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 from shapely.geometry import MultiPolygon, Polygon
 
+from cosim.bystanders import bystanders
 from cosim.clock import Clock
 from cosim.control import Limits, command_of
 from cosim.errors import PolicyError
@@ -26,7 +27,7 @@ from cosim.events import EventQuery, EventState
 from cosim.geometry import Polyline, Pose
 from cosim.ports import Camera, Crowd, Director, Observation, Policy, Privileged, World
 from cosim.scenario import Scenario
-from cosim.state import STILL, Command, Frame, RobotState
+from cosim.state import STILL, Command, Frame, People, RobotState
 from cosim.step import Reset, Step
 
 ROUTE_WINDOW_M = 10.0
@@ -63,7 +64,7 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
                 robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings, parts.free
             )
             command = ask(parts.policy, observe(tick, clock, robot, frame, known), parts.limits)
-        asked = query(scenario, clock, tick, robot, route_s_m, parts.world.footprint_m, states)
+        asked = query(scenario, clock, tick, robot, street.people, route_s_m, parts.world.footprint_m, states)
         reply = parts.director.react(asked)
         street_after = parts.crowd.step(robot, reply)
         motion = parts.world.step(command, street, street_after, clock.substeps)
@@ -101,6 +102,7 @@ def query(
     clock: Clock,
     tick: int,
     robot: RobotState,
+    people: People,
     route_s_m: float,
     footprint_m: tuple[float, float],
     states: tuple[EventState, ...],
@@ -120,6 +122,7 @@ def query(
         robot_width_m=footprint_m[1],
         events=scenario.events,
         states=states,
+        bystanders=bystanders(people, scenario.events),
     )
 
 

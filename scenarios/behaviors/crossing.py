@@ -13,6 +13,7 @@ import msgspec
 from cosim.events import Event, EventQuery, EventState, Walker
 from cosim.state import Doing
 from scenarios.behaviors.behavior import Behavior, entered
+from scenarios.behaviors.sight import Sight, sight_of
 from scenarios.behaviors.walking import edge_m, gave_up, placed, pressed_on, walked_on
 
 BEFORE_M: Final = 0.8
@@ -49,19 +50,22 @@ def line_m(event: Event, number: int) -> float:
 
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
-    walkers = tuple(_crossed(event, walker, number, query) for number, walker in enumerate(state.walkers))
+    walkers = tuple(
+        _crossed(event, walker, number, sight_of(event, number, query)) for number, walker in enumerate(state.walkers)
+    )
     if state.phase == "acting" and all(_across(event, walker, number) for number, walker in enumerate(walkers)):
         return msgspec.structs.replace(state, phase="over", since_tick=query.tick, walkers=walkers)
     return msgspec.structs.replace(state, walkers=walkers)
 
 
-def _crossed(event: Event, walker: Walker, number: int, query: EventQuery) -> Walker:
+def _crossed(event: Event, walker: Walker, number: int, sight: Sight) -> Walker:
+    query = sight.query
     heading_rad = event.heading_rad + (math.pi if from_front(number) else 0.0)
     if from_front(number) and not gave_up(walker, query) and not _passed(event, walker, query):
-        return pressed_on(walker, heading_rad, event.speed_mps, query)
+        return pressed_on(walker, heading_rad, event.speed_mps, sight)
     if _across(event, walker, number):
         return walker
-    return walked_on(walker, heading_rad, event.speed_mps, query)
+    return walked_on(walker, heading_rad, event.speed_mps, sight)
 
 
 def _along_m(event: Event, x_m: float, y_m: float) -> float:

@@ -1,5 +1,7 @@
 """`frontal`: walks straight at the robot's current position, commits to a line, passes and walks on.
 
+Who steps round somebody on the way takes aim anew.
+
 One that has run into the robot does not push it: it stands, gives up, and goes round.
 """
 
@@ -13,6 +15,7 @@ import msgspec
 from cosim.events import Event, EventQuery, EventState, Walker
 from cosim.state import Doing
 from scenarios.behaviors.behavior import Behavior, ahead
+from scenarios.behaviors.sight import sight_of
 from scenarios.behaviors.walking import gave_up, placed, pressed_on, walked_on
 
 TRIGGER_M: Final = 20.0
@@ -26,17 +29,18 @@ def _begin(event: Event) -> tuple[Walker, ...]:
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
     (walker,) = state.walkers
+    sight = sight_of(event, 0, query)
     dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
     back_rad = event.heading_rad + math.pi
     passed = dx * math.cos(back_rad) + dy * math.sin(back_rad) < -1.0
     if state.phase == "acting" and (passed or gave_up(walker, query)):
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
     if state.phase == "over":
-        return msgspec.structs.replace(state, walkers=(walked_on(walker, back_rad, event.speed_mps, query),))
+        return msgspec.structs.replace(state, walkers=(walked_on(walker, back_rad, event.speed_mps, sight),))
     heading = walker.aim_rad if walker.aim_rad is not None else math.atan2(dy, dx)
     if walker.aim_rad is None and math.hypot(dx, dy) <= COMMIT_M:
         walker = msgspec.structs.replace(walker, aim_rad=heading)
-    return msgspec.structs.replace(state, walkers=(pressed_on(walker, heading, event.speed_mps, query),))
+    return msgspec.structs.replace(state, walkers=(pressed_on(walker, heading, event.speed_mps, sight),))
 
 
 def _doing(event: Event, state: EventState, number: int) -> Doing:

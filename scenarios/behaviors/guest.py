@@ -1,4 +1,7 @@
-"""A guest: an injected pedestrian that walks its path, stays at the end for its time, and is gone."""
+"""A guest: an injected pedestrian that walks its path, stays at the end for its time, and is gone.
+
+It goes round people and the robot; a point of its path at which somebody is counts as reached beside it.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,7 @@ import msgspec
 
 from cosim.events import Actor, EventQuery, Walker
 from cosim.injection import Injected, Injection
+from scenarios.behaviors.sight import sight_of_guest, taken
 from scenarios.behaviors.walking import turned, walked_to
 
 
@@ -33,7 +37,7 @@ def arriving(injected: Injected) -> Guest:
 
 
 def advanced(guest: Guest, query: EventQuery) -> Guest | None:
-    """One tick on; None once it is gone. It steps round the robot."""
+    """One tick on; None once it is gone."""
     injection, walker = guest.injection, guest.walker
     if guest.arrived_tick is not None:
         if (query.tick - guest.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
@@ -41,20 +45,29 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
         if injection.heading_rad is not None:
             heading = turned(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
             walker = msgspec.structs.replace(walker, heading_rad=heading)
-        return guest._replace(walker=walker, moved_m=0.0)
+        return guest._replace(walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0)
     goal = injection.path[guest.leg]
-    after = walked_to(walker, *goal, injection.speed_mps, query)
+    sight = sight_of_guest(shown_id(injection), query)
+    after = walked_to(walker, *goal, injection.speed_mps, sight)
+    reached = (after.x_m, after.y_m) == goal or taken(walker, goal, sight)
+    vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))
+    after = msgspec.structs.replace(after, vx_mps=vx_mps, vy_mps=vy_mps)
     moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
-    leg = guest.leg + ((after.x_m, after.y_m) == goal)
+    leg = guest.leg + reached
     arrived = query.tick if leg == len(injection.path) else None
     return guest._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
+
+
+def shown_id(injection: Injection) -> str:
+    """The id under which the world shows a guest."""
+    return f"ei-{injection.id}"
 
 
 def actor_of(guest: Guest, tick_ms: int) -> Actor:
     """The guest as the world shows it."""
     walker = guest.walker
     return Actor(
-        id=f"ei-{guest.injection.id}",
+        id=shown_id(guest.injection),
         x_m=walker.x_m,
         y_m=walker.y_m,
         heading_rad=walker.heading_rad,

@@ -1,6 +1,7 @@
 """`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that keeps its velocity.
 
-Direction and speed are fixed at the trigger. It walks to the other edge of the sidewalk and on along it.
+Direction and speed are fixed at the trigger, and anew where it had to step round somebody. It walks to the other edge
+of the sidewalk and on along it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import msgspec
 from cosim.events import Event, EventQuery, EventState, Walker
 from cosim.state import Doing
 from scenarios.behaviors.behavior import Behavior, ahead
+from scenarios.behaviors.sight import sight_of
 from scenarios.behaviors.walking import edge_m, gave_up, placed, pressed_on, walked_on
 
 TRIGGER_M: Final = 4.0
@@ -27,8 +29,9 @@ def _begin(event: Event) -> tuple[Walker, ...]:
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
     (walker,) = state.walkers
+    sight = sight_of(event, 0, query)
     if walker.aim_rad is None or walker.pace_mps is None:
-        aim_rad, pace_mps = collision_course(walker, query, event.side)
+        aim_rad, pace_mps = _course(event, walker, query)
         walker = msgspec.structs.replace(walker, aim_rad=aim_rad, pace_mps=pace_mps)
         assert walker.aim_rad is not None and walker.pace_mps is not None
     dx, dy = walker.x_m - event.x_m, walker.y_m - event.y_m
@@ -38,8 +41,21 @@ def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
         state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
     if state.phase == "over":
         away_rad = event.heading_rad + math.pi
-        return msgspec.structs.replace(state, walkers=(walked_on(walker, away_rad, event.speed_mps, query),))
-    return msgspec.structs.replace(state, walkers=(pressed_on(walker, walker.aim_rad, walker.pace_mps, query),))
+        return msgspec.structs.replace(state, walkers=(walked_on(walker, away_rad, event.speed_mps, sight),))
+    return msgspec.structs.replace(state, walkers=(pressed_on(walker, walker.aim_rad, walker.pace_mps, sight),))
+
+
+def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:
+    """The collision course; straight on at its pace for who was led aside, once the robot can be met no more."""
+    aim_rad, pace_mps = collision_course(walker, query, event.side)
+    if walker.pace_mps is None:
+        return aim_rad, pace_mps
+    across_rad = event.heading_rad - event.side * math.pi / 2
+    dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
+    passed = math.cos(query.robot_heading_rad) * dx + math.sin(query.robot_heading_rad) * dy <= 0.0
+    if passed or math.cos(aim_rad - across_rad) <= 0.0:
+        return across_rad, walker.pace_mps
+    return aim_rad, pace_mps
 
 
 def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:

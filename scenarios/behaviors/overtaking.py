@@ -10,6 +10,7 @@ import msgspec
 from cosim.events import Event, EventQuery, EventState, Walker
 from cosim.state import Doing
 from scenarios.behaviors.behavior import Behavior, behind
+from scenarios.behaviors.sight import sight_of
 from scenarios.behaviors.walking import edge_m, placed, walked_to
 
 TRIGGER_M: Final = 1.0
@@ -37,7 +38,7 @@ def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
     ahead_m = along_m + LOOK_AHEAD_M
     aim = (event.x_m + cos * ahead_m - sin * left_m, event.y_m + sin * ahead_m + cos * left_m)
     pace_mps = min(max(event.speed_mps, query.robot_v_mps + FASTER_MPS), FASTEST_MPS)
-    return msgspec.structs.replace(state, walkers=(walked_to(walker, *aim, pace_mps, query),))
+    return msgspec.structs.replace(state, walkers=(walked_to(walker, *aim, pace_mps, sight_of(event, 0, query)),))
 
 
 def _doing(event: Event, state: EventState, number: int) -> Doing:

@@ -77,7 +77,20 @@ def _advance(event: Event, state: EventState, query: EventQuery) -> EventState:
         math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M for w in state.walkers
     ):
         return msgspec.structs.replace(state, phase="gone", since_tick=query.tick)
-    return behavior.act(event, state, query)
+    return _timed(state, behavior.act(event, state, query), query)
+
+
+def _timed(before: EventState, after: EventState, query: EventQuery) -> EventState:
+    """The state with the velocities of this tick's steps in it."""
+    walkers = tuple(
+        msgspec.structs.replace(
+            new,
+            vx_mps=(new.x_m - old.x_m) * 1000 / query.tick_ms,
+            vy_mps=(new.y_m - old.y_m) * 1000 / query.tick_ms,
+        )
+        for old, new in zip(before.walkers, after.walkers, strict=True)
+    )
+    return msgspec.structs.replace(after, walkers=walkers)
 
 
 def _shown(event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:

@@ -15,6 +15,7 @@ from cosim.events import Event, EventQuery, EventState, Walker
 from cosim.geometry import wrap_angle
 from cosim.state import PERSON_RADIUS_M, Doing
 from scenarios.behaviors.behavior import Behavior, ahead
+from scenarios.behaviors.sight import sight_of
 from scenarios.behaviors.walking import edge_m, placed, spot, turned, walked_to
 
 TRIGGER_M: Final = 10.0
@@ -68,10 +69,11 @@ def _standing(places: Callable[[Event], tuple[Place, ...]], facing: Facing, doin
             state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
         goals = places(event) if state.phase == "acting" else [_aside(event, k) for k in range(event.people)]
         walkers = []
-        for walker, goal in zip(state.walkers, goals, strict=True):
+        for number, (walker, goal) in enumerate(zip(state.walkers, goals, strict=True)):
             x_m, y_m = spot(event, *goal)
             if (walker.x_m, walker.y_m) != (x_m, y_m):
-                walkers.append(walked_to(walker, x_m, y_m, event.speed_mps, query))
+                sight, insisting = sight_of(event, number, query), state.phase == "acting"
+                walkers.append(walked_to(walker, x_m, y_m, event.speed_mps, sight, insisting=insisting))
             elif state.phase == "acting":
                 heading = turned(walker.heading_rad, facing(event, walker, query, state), tick_s)
                 walkers.append(msgspec.structs.replace(walker, heading_rad=heading))
