@@ -16,7 +16,7 @@ from rich.table import Column, Table
 from cosim.box import box_of
 
 if TYPE_CHECKING:
-    from cosim.report.above import Image
+    from cosim.report.legend import Image
     from cosim.streetmap import StreetMap
     from scenarios.survey import Survey
 
@@ -165,8 +165,8 @@ def _picture(street_map: StreetMap, part: tuple[float, float, float, float]) -> 
     """A part of a map from above, (H, W, 3) uint8 RGB."""
     import shapely
 
-    from cosim.report.above import LEGEND_PX, Sheet, draw_streets
+    from cosim.report.above import Sheet, draw_streets
 
     sheet = Sheet(part)
     draw_streets(sheet, street_map, shapely.box(*part))
-    return sheet.image[:-LEGEND_PX]
+    return sheet.image

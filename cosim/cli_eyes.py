@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cosim.errors import UsageError, unknown
+
+if TYPE_CHECKING:
+    from scenarios.look import View
 
 out = Console()
 err = Console(stderr=True)
@@ -46,11 +49,9 @@ def look(
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
     from scenarios.catalog import chosen, with_residents
     from scenarios.catalog import suite as shipped
-    from scenarios.look import VIEWS, look
+    from scenarios.look import look
 
-    picked = next((name for name in VIEWS if name == view), None)
-    if picked is None:
-        raise unknown("view", view, VIEWS)
+    picked = view_of(view)
     pixels = size_of(size)
     whole = shipped(suite)
     (one,) = chosen(whole if residents is None else with_residents(whole, residents), [scenario])
@@ -69,12 +70,14 @@ def film(
     start: Annotated[float, typer.Option("--from", min=0.0, help="First second.")] = 0.0,
     end: Annotated[float | None, typer.Option("--to", help="Last second; by default the end.")] = None,
     size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
+    view: Annotated[str, typer.Option(help="follow (from behind), above, or robot: what it sees.")] = "follow",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
-    """Film an episode of a run: from behind the robot, with its own view, the map, events and failures."""
+    """Film an episode of a run: from behind the robot or above it, with what it sees, the map, events and failures."""
     from scenarios.film import Cut, film
 
+    picked = view_of(view)
     bars = Progress(
         TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=err
     )
@@ -84,10 +87,20 @@ def film(
             folder,
             episode,
             output,
-            Cut(start, math.inf if end is None else end, size_of(size), speed, camera_here(camera)),
+            Cut(start, math.inf if end is None else end, size_of(size), speed, camera_here(camera), picked),
             lambda done, of: bars.update(task, completed=done, total=of),
         )
     out.print(f"Film: {output}", soft_wrap=True, highlight=False)
+
+
+def view_of(name: str) -> View:
+    """The view called so. Raises UsageError with the valid names."""
+    from scenarios.look import VIEWS
+
+    for view in VIEWS:
+        if view == name:
+            return view
+    raise unknown("view", name, VIEWS)
 
 
 def size_of(text: str) -> tuple[int, int]:

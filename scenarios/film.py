@@ -1,4 +1,4 @@
-"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from the robot, from above.
+"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from above or from the robot.
 
 The replay is the same episode: at its end the state hash is held against the record's.
 """
@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 
 from cosim.clock import Clock
@@ -22,7 +21,7 @@ from cosim.ports import CameraSpec, Eyes
 from cosim.record import Record, begun
 from cosim.referee import Verdict
 from cosim.report import hud
-from cosim.report.above import Image
+from cosim.report.legend import Image
 from cosim.report.minimap import Minimap
 from cosim.report.video import Video
 from cosim.scenario import Scenario
@@ -30,25 +29,37 @@ from cosim.state import RobotState, Street
 from cosim.step import Step
 from physics.cameras import CameraChoice
 from scenarios.assemble import place, staged
-from scenarios.look import behind
+from scenarios.look import View, behind, over
 from scenarios.replay import check, recorded
 from scenarios.run import drive
 
 EASE_S: Final = 0.5
 """The follower's heading lags the robot's by about this much."""
 SMALLEST_PX: Final = (320, 180)
-ROBOT_EYE: Final = CameraSpec(384, 288, 75.0)
+ROBOT_FOV_DEG: Final = 75.0
+"""Of the robot's camera, up and down, at 4:3; wider pictures show no more to the sides."""
+ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
+FOV_DEG: Final = 62.0
+"""Of the views from behind and from above, up and down."""
+ABOVE_SLANT: Final = 0.22
+"""From above the eye is behind what it looks at by this share of its height."""
+ABOVE_REST: Final = (2.0, 0.0, 10.0)
+"""What it looks at when nothing happens, metres ahead and to the left of the robot, and how high it is."""
+ABOVE_HIGH_M: Final = (7.5, 12.0)
+NEAR_M: Final = 8.0
+"""Event people this near are kept in the picture from above."""
 
 
 class Cut(NamedTuple):
     """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times real time;
-    camera: what draws it."""
+    camera: what draws it; view: from where."""
 
     from_s: float = 0.0
     to_s: float = math.inf
     size: tuple[int, int] = (1280, 720)
     speed: int = 1
     camera: CameraChoice = "auto"
+    view: View = "follow"
 
 
 Tell = Callable[[int, int], None]
@@ -73,14 +84,23 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
         stage = stack.enter_context(staged(scenario, driver, cut.camera, script=record.injections))
-        camera = stack.enter_context(stage.eyes(ROBOT_EYE))
-        reel = _Reel(scenario, record, Minimap(street_map, scenario), camera, video, cut, last, tell)
+        camera = stack.enter_context(stage.eyes(robot_eye(cut)))
+        minimap = Minimap(street_map, scenario, stage.parts.world.footprint_m)
+        reel = _Reel(scenario, record, minimap, camera, video, cut, last, tell)
         again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)
     try:
         check(folder, told, again.state_hash)
     except RunError:
         output.unlink(missing_ok=True)
         raise
+
+
+def robot_eye(cut: Cut) -> CameraSpec:
+    """The robot's camera as large as it is in the film."""
+    layout = hud.Layout.of(*cut.size)
+    area = layout.view if cut.view == "robot" else layout.second
+    up = min(ROBOT_ASIDE * area.height / area.width, math.tan(math.radians(ROBOT_FOV_DEG / 2)))
+    return CameraSpec(area.width, area.height, math.degrees(2.0 * math.atan(up)))
 
 
 class _Reel:
@@ -102,7 +122,8 @@ class _Reel:
         self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
         self._triggered: set[str] = set()
         self._caption, self._caption_until = ("", hud.INK), -1
-        self._heading: Floats | None = None
+        self._ahead: Floats = np.zeros(2)
+        self._over: Floats = np.array(ABOVE_REST)
 
     def take(self, step: Step, verdict: Verdict) -> None:
         """One tick of the episode; drawn if it lies within the cut."""
@@ -110,7 +131,8 @@ class _Reel:
         robot = step.motion.robot
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
         share = Clock().tick_s / EASE_S
-        self._heading = ahead if self._heading is None else (1.0 - share) * self._heading + share * ahead
+        self._ahead = (1.0 - share) * self._ahead + share * ahead if self._ahead.any() else ahead
+        self._over = (1.0 - share) * self._over + share * _framed(robot, step.street_after)
         first = Clock().ticks(self._cut.from_s)
         if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
             self._video.add(self._picture(step, robot, step.street_after))
@@ -118,21 +140,33 @@ class _Reel:
 
     def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
         width, height = self._cut.size
-        eye, target = behind(robot, self._heading)
-        image = np.ascontiguousarray(self._camera.picture(eye, target, street, robot, self._cut.size, 55.0).rgb)
-        small = (width * 3 // 10 // 2 * 2, width * 9 // 40 // 2 * 2)
-        seen = cv2.resize(self._camera.render(robot, street).rgb, small, interpolation=cv2.INTER_AREA)
-        hud.inset(image, seen.astype(np.uint8), (16, height - 60 - small[1]), "robot's camera")
-        side = width * 9 // 40
-        hud.inset(image, self._minimap.picture(robot, street, side), (width - 16 - side, 16))
+        layout = hud.Layout.of(width, height)
+        image: Image = np.zeros((height, width, 3), dtype=np.uint8)
+        seen = self._camera.render(robot, street).rgb
+        if self._cut.view == "robot":
+            hud.fill(image, layout.view, seen)
+            hud.fill(image, layout.second, self._outside("follow", layout.second, robot, street), "from behind")
+        else:
+            hud.fill(image, layout.view, self._outside(self._cut.view, layout.view, robot, street))
+            hud.fill(image, layout.second, seen, "robot's camera")
+        area = layout.map
+        hud.fill(image, area, self._minimap.picture(robot, street, (area.width, area.height), self._ahead))
         time_s = Clock().time_s(step.tick)
         counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
         done = step.route_s_after_m / self._scenario.route_line.length_m
         left = f"{self._scenario.id}  {self._record.policy}  {time_s:5.1f} s  {robot.v_mps:.1f} m/s"
-        hud.bar(image, left, f"route {100.0 * done:.0f} %   {counts}", done)
+        hud.bar(image, layout.bar, left, f"route {100.0 * done:.0f} %   {counts}", done)
         if step.tick < self._caption_until:
-            hud.caption(image, *self._caption)
+            hud.caption(image, layout.view, *self._caption)
         return image
+
+    def _outside(self, view: View, area: hud.Area, robot: RobotState, street: Street) -> Image:
+        """What somebody sees who follows the robot, behind it or above it."""
+        if view == "follow":
+            eye, target = behind(robot, self._ahead)
+        else:
+            eye, target = over(robot, self._ahead, self._over, ABOVE_SLANT)
+        return self._camera.picture(eye, target, street, robot, (area.width, area.height), FOV_DEG).rgb
 
     def _note(self, step: Step, verdict: Verdict) -> None:
         """Count failures, and choose what is captioned."""
@@ -150,3 +184,17 @@ class _Reel:
 
     def _say(self, tick: int, text: str, colour: tuple[int, int, int]) -> None:
         self._caption, self._caption_until = (text, colour), tick + Clock().ticks(hud.CAPTION_S)
+
+
+def _framed(robot: RobotState, street: Street) -> Floats:
+    """(3,) metres ahead and left of the robot, and height, from which it and the event people near it can be seen."""
+    cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
+    event = [name.startswith("e") for name in street.people.ids]
+    offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])
+    near = offset[np.hypot(*offset.T) < NEAR_M]
+    if not len(near):
+        return np.array(ABOVE_REST)
+    every = np.vstack([near, (0.0, 0.0)])
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    reach_m = float(np.hypot(*(every - middle).T).max())
+    return np.append(middle, np.clip(2.0 * reach_m + 3.0, *ABOVE_HIGH_M))

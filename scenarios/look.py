@@ -6,6 +6,7 @@ import math
 from typing import Final, Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from cosim.clock import Clock
 from cosim.geometry import Floats
@@ -13,7 +14,7 @@ from cosim.policies.load import load_policy
 from cosim.ports import CameraSpec
 from cosim.record import begun
 from cosim.referee import Verdict
-from cosim.report.above import Image
+from cosim.report.legend import Image
 from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.step import Step
@@ -27,6 +28,8 @@ BEHIND_M: Final = 4.6
 ABOVE_M: Final = 2.5
 AHEAD_M: Final = 3.0
 HIGH_M: Final = 28.0
+OVER_SLANT: Final = 0.55
+"""From above the eye is behind what it looks at by this share of its height."""
 
 
 class _Reached(Exception):
@@ -68,14 +71,26 @@ def look(
 
 def behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
     """(eye, target), (3,) metres: behind and above the robot, looking ahead. ahead: (2,), by default its heading."""
-    heading = robot.pose.heading_rad
-    way = np.array([math.cos(heading), math.sin(heading)]) if ahead is None else ahead / np.hypot(*ahead)
-    foot = robot.pose.xy
+    way, foot = _way(robot, ahead), robot.pose.xy
     return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(foot + AHEAD_M * way, robot.z_m + 0.5)
 
 
-def over(robot: RobotState) -> tuple[Floats, Floats]:
-    """(eye, target), (3,) metres: from high behind the robot down on it."""
+def over(
+    robot: RobotState,
+    ahead: Floats | None = None,
+    at_m: ArrayLike = (0.0, 0.0, HIGH_M),
+    slant: float = OVER_SLANT,
+) -> tuple[Floats, Floats]:
+    """(eye, target), (3,) metres: from high above, a little behind, down on the robot or what is near it.
+
+    at_m: (3,) metres ahead and to the left of the robot that are looked at, and how high the eye is.
+    """
+    way = _way(robot, ahead)
+    forward_m, left_m, high_m = np.asarray(at_m, dtype=float).tolist()
+    foot = robot.pose.xy + forward_m * way + left_m * np.array([-way[1], way[0]])
+    return np.append(foot - slant * high_m * way, robot.z_m + high_m), np.append(foot, robot.z_m)
+
+
+def _way(robot: RobotState, ahead: Floats | None) -> Floats:
     heading = robot.pose.heading_rad
-    way = np.array([math.cos(heading), math.sin(heading)])
-    return np.append(robot.pose.xy - 0.55 * HIGH_M * way, robot.z_m + HIGH_M), np.append(robot.pose.xy, robot.z_m)
+    return np.array([math.cos(heading), math.sin(heading)]) if ahead is None else ahead / np.hypot(*ahead)

@@ -18,9 +18,11 @@ import pytest
 from cosim.errors import RunError
 from cosim.policies.replay import Replay
 from cosim.ports import Observation
+from cosim.report.hud import Layout
 from cosim.report.video import Video
 from cosim.scenario import City, CrowdSpec, Suite, write_suite
 from cosim.walks import WalkGraph
+from scenarios.film import Cut, robot_eye
 
 pytestmark = pytest.mark.engine
 
@@ -62,6 +64,31 @@ def test_a_film_shows_the_seconds_asked_for(desk: Path) -> None:
     assert not list(desk.glob("*.part"))
 
 
+def test_a_film_is_from_above_or_from_the_robot(desk: Path) -> None:
+    """--view puts another picture beside the same map, over the same bar."""
+    seen = []
+    for view in ("above", "robot"):
+        words = ("film", "run", "t-0", "--to", "0.1", "--size", "320x180", "--view", view, "-o", f"{view}.mp4")
+        done = cosim(*words, cwd=desk)
+        assert done.returncode == 0, done.stderr
+        with av.open(str(desk / f"{view}.mp4")) as film:
+            seen.append(next(film.decode(video=0)).to_ndarray(format="rgb24").astype(float))
+    layout = Layout.of(320, 180)
+    apart = np.abs(seen[0] - seen[1]).mean(axis=2)
+    assert apart[: layout.view.height, : layout.view.width].mean() > 15
+    assert apart[layout.map.y + 4 : layout.bar.y - 4, layout.map.x + 4 :].mean() < 3
+
+
+@pytest.mark.parametrize("size", [(320, 180), (1280, 720), (1024, 1024)])
+def test_the_robots_camera_sees_no_farther_aside_in_a_film(size: tuple[int, int]) -> None:
+    """Whatever the shape of its part of the film, the camera is as wide as at 4:3, or narrower."""
+    for view in ("follow", "robot"):
+        spec = robot_eye(Cut(size=size, view=view))  # type: ignore[arg-type]
+        aside = np.tan(np.radians(0.5 * spec.fov_deg)) * spec.width / spec.height
+        assert aside <= np.tan(np.radians(37.5)) * 4 / 3 + 1e-9 and spec.fov_deg <= 75.0 + 1e-9
+        assert aside > 0.5
+
+
 def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
     """A film of another episode than the recorded one is no film of it: an error, and no file."""
     path = desk / "run" / "episodes" / "t-0" / "record.json"
@@ -86,6 +113,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
         (("film", "run", "t-0", "--size", "64x64"), "nothing can be read"),
         (("film", "run", "t-0", "-o", "film.gif"), "ends in .mp4"),
         (("film", "run", "t-0", "-o", "nowhere/film.mp4"), "cannot be written"),
+        (("film", "run", "t-0", "--view", "inside"), "unknown view"),
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
     ],

@@ -177,6 +177,20 @@ def test_who_sits_has_the_hips_on_the_seat_and_the_feet_before_it() -> None:
         assert at["left_ankle"][2] == pytest.approx(rest[INDEX["left_ankle"], 2], abs=0.02)
 
 
+def test_talkers_speak_and_listen() -> None:
+    """Who talks has the hands up for about half of the time, and never so far ahead that they would touch those of
+    somebody 1 m away."""
+    clips = own_clips()
+    for k, family in enumerate(FAMILIES):
+        height_m = skeleton(family).height_m
+        made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
+        hands = np.isin(made.joints[:, 0], [INDEX["left_hand"], INDEX["right_hand"]])
+        shown = [posed(made, int(clips.gestures["talk"][k]) + frame)[hands] for frame in range(0, clips.loop_frames, 4)]
+        assert max(float(hand[:, 0].max()) for hand in shown) < 0.5
+        up = np.array([hand[:, 2].max() > 0.67 * height_m for hand in shown])
+        assert 0.35 < up.mean() < 0.65
+
+
 def test_looks_hang_on_the_name_alone() -> None:
     """The same name looks the same in another process, another seed dresses it anew at the same stature."""
     names = [f"c{i}" for i in range(60)]

@@ -15,15 +15,23 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.geometry import Floats
 from cosim.record import Log, Record
+from cosim.report.legend import Colour, Image, legend, wide_px
 from cosim.scenario import Scenario
 from cosim.streetmap import Lane, StreetMap
 
 MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400
+USUAL_PX: Final = 1400
+"""Longest side of the picture of a short way."""
 PX_PER_M: Final = 10.0
-LEGEND_PX: Final = 34
+TEXT_GAP_PX: Final = 6
+PLAIN_STD: Final = 25.0
+"""Words go elsewhere if what is under them varies more than this."""
+EVENT_RING_M: Final = 0.9
+FAILURE_RING_M: Final = 0.6
+END_M: Final = 0.6
+"""Radius of the dots at start and goal."""
 
-Colour = tuple[int, int, int]
 GROUND: Final[Colour] = (214, 226, 214)
 ROAD: Final[Colour] = (120, 120, 124)
 VERGE: Final[Colour] = (150, 200, 150)
@@ -38,23 +46,22 @@ RESIDENT: Final[Colour] = (0, 140, 110)
 RESET: Final[Colour] = (120, 120, 120)
 FAILURES: Final[dict[str, Colour]] = {"collision": (220, 0, 0), "out_of_lane": (190, 0, 190), "freezing": (0, 140, 200)}
 
-Image = NDArray[np.uint8]
-
 
 class Sheet:
-    """A picture of a part of the world: x east is right, y north is up."""
+    """A picture of a part of the world: x east is right, y north is up. bounds: x0, y0, x1, y1 in metres."""
 
-    def __init__(self, bounds: tuple[float, float, float, float]) -> None:
+    def __init__(self, bounds: tuple[float, float, float, float], px_per_m: float = PX_PER_M) -> None:
         x0, y0, x1, y1 = bounds
-        self._scale = min(PX_PER_M, LONGEST_PX / max(x1 - x0, y1 - y0))
+        self.px_per_m = min(px_per_m, LONGEST_PX / max(x1 - x0, y1 - y0))
         self._x0, self._y1 = x0, y1
-        width, height = math.ceil((x1 - x0) * self._scale), math.ceil((y1 - y0) * self._scale)
-        self.image: Image = np.full((height + LEGEND_PX, width, 3), GROUND, dtype=np.uint8)
+        width, height = math.ceil((x1 - x0) * self.px_per_m), math.ceil((y1 - y0) * self.px_per_m)
+        self.image: Image = np.full((height, width, 3), GROUND, dtype=np.uint8)
+        self._labels: list[Polygon] = []
 
     def px(self, xy: Floats) -> NDArray[np.int32]:
         """World metres (N, 2) as sixteenths of pixels."""
         xy = np.asarray(xy, dtype=float).reshape(-1, 2)
-        at = np.column_stack([xy[:, 0] - self._x0, self._y1 - xy[:, 1]]) * self._scale * 16
+        at = np.column_stack([xy[:, 0] - self._x0, self._y1 - xy[:, 1]]) * self.px_per_m * 16
         return np.round(at).astype(np.int32)
 
     def area(self, shape: Polygon | MultiPolygon, colour: Colour) -> None:
@@ -64,17 +71,44 @@ class Sheet:
                 cv2.fillPoly(self.image, rings, colour, cv2.LINE_AA, 4)
 
     def line(self, xy: Floats, colour: Colour, width_m: float) -> None:
-        thickness = max(1, round(width_m * self._scale))
+        thickness = max(1, round(width_m * self.px_per_m))
         cv2.polylines(self.image, [self.px(xy)], False, colour, thickness, cv2.LINE_AA, 4)
 
     def dot(self, xy: Floats, colour: Colour, radius_m: float, *, filled: bool = True) -> None:
-        radius = max(2, round(radius_m * self._scale))
+        radius = max(2, round(radius_m * self.px_per_m))
         for x, y in self.px(xy):
             cv2.circle(self.image, (int(x), int(y)), radius * 16, colour, -1 if filled else 2, cv2.LINE_AA, 4)
 
-    def text(self, xy: Sequence[float], words: str, colour: Colour) -> None:
-        x, y = self.px(np.array([xy]))[0] // 16
-        cv2.putText(self.image, words, (int(x) + 8, int(y) - 6), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
+    def text(self, xy: Sequence[float], words: str, colour: Colour, beside_m: float = 0.0, size: float = 0.5) -> None:
+        """Words on a light plate near a place: below it, above it or beside it, where there is least under them.
+
+        beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's units.
+        """
+        x, y = (self.px(np.array([xy]))[0] // 16).tolist()
+        clear = round(beside_m * self.px_per_m)
+        wide, tall, gap = wide_px(words, size), round(22 * size), clear + TEXT_GAP_PX
+        left = x - wide // 2
+        corners = [(left, y + gap + tall), (left, y - gap), (x + gap, y + tall // 2), (x - gap - wide, y + tall // 2)]
+        for row in (1, 2, 3):
+            further = row * (tall + 10)
+            corners += [(left, y + gap + tall + further), (left, y - gap - further)]
+        height, width = self.image.shape[:2]
+        corners = [(max(3, min(a, width - wide - 3)), max(tall + 3, min(b, height - 5))) for a, b in corners]
+        plates = [shapely.box(a - 3, b - tall - 3, a + wide + 3, b + 5) for a, b in corners]
+        mark = shapely.box(x - clear, y - clear, x + clear, y + clear)
+        taken = shapely.union_all([*self._labels, mark])
+        free = [k for k, plate in enumerate(plates) if not taken.intersects(plate)]
+        under = [self._pixels(plate).std() for plate in plates]
+        chosen = min(free, key=lambda k: (round(under[k] / PLAIN_STD), k)) if free else 0
+        self._labels += [plates[chosen], mark]
+        plate = self._pixels(plates[chosen])
+        plate[:] = 191 + plate // 4
+        cv2.putText(self.image, words, corners[chosen], cv2.FONT_HERSHEY_SIMPLEX, size, colour, 1, cv2.LINE_AA)
+
+    def _pixels(self, box: Polygon) -> Image:
+        """The part of the picture in a box of pixels."""
+        x0, y0, x1, y1 = (max(int(edge), 0) for edge in box.bounds)
+        return self.image[y0:y1, x0:x1]
 
 
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
@@ -82,7 +116,7 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
     route = np.array(scenario.route)
     low, high = route.min(axis=0) - MARGIN_M, route.max(axis=0) + MARGIN_M
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-    sheet = Sheet(bounds)
+    sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1])))
     draw_streets(sheet, street_map, shapely.box(*bounds))
     sheet.line(route, ROUTE, 0.4)
     for barrier in scenario.barriers:
@@ -93,18 +127,18 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
     sheet.dot(log.people_xy[log.people_resident], RESIDENT, 0.2)
     sheet.dot(log.people_xy[log.people_event], EVENT, 0.25)
     draw_track(sheet, log)
+    sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
+    sheet.text(scenario.start[:2], "start", TRACK, END_M)
+    sheet.text(scenario.goal, "goal", TRACK, END_M)
     for event in scenario.events:
-        sheet.dot(np.array([[event.x_m, event.y_m]]), EVENT, 0.9, filled=False)
-        sheet.text((event.x_m, event.y_m), f"{event.id} {event.kind}", EVENT)
+        sheet.dot(np.array([[event.x_m, event.y_m]]), EVENT, EVENT_RING_M, filled=False)
+        sheet.text((event.x_m, event.y_m), f"{event.id} {event.kind}", EVENT, EVENT_RING_M)
     for failure in record.failures:
         colour = FAILURES[failure.kind]
-        sheet.dot(np.array([[failure.x_m, failure.y_m]]), colour, 0.6, filled=False)
-        sheet.text((failure.x_m, failure.y_m), f"{failure.kind} {failure.tick * log.tick_s:.0f} s", colour)
-    sheet.text(scenario.start[:2], "start", TRACK)
-    sheet.text(scenario.goal, "goal", TRACK)
-    sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, 0.6)
-    legend(sheet.image, scenario, record, len(log) * log.tick_s)
-    return sheet.image
+        sheet.dot(np.array([[failure.x_m, failure.y_m]]), colour, FAILURE_RING_M, filled=False)
+        words = f"{failure.kind} {failure.tick * log.tick_s:.0f} s"
+        sheet.text((failure.x_m, failure.y_m), words, colour, FAILURE_RING_M)
+    return legend(sheet.image, _facts(scenario, record, len(log) * log.tick_s))
 
 
 def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
@@ -138,15 +172,19 @@ def draw_track(sheet: Sheet, log: Log) -> None:
                 sheet.line(np.array(ends), RESET, 0.1)
 
 
-def legend(image: Image, scenario: Scenario, record: Record, time_s: float) -> None:
-    """One line below the picture."""
-    image[-LEGEND_PX:] = 255
+def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str, Colour]]:
+    """What stands below the picture: how the episode went, and what each colour means."""
     measures = record.measures
-    words = (
-        f"{record.scenario}  policy {record.policy}  {record.ended} after {time_s:.0f} s  "
-        f"RC {measures.get('route_completion') or 0.0:.2f}  failures {measures.get('failures') or 0.0:.0f}   "
-        "blue route, black track, red barriers, violet people, orange events"
-    )
-    if scenario.crowd.residents:
-        words += ", green residents"
-    cv2.putText(image, words, (8, len(image) - 11), cv2.FONT_HERSHEY_SIMPLEX, 0.5, TRACK, 1, cv2.LINE_AA)
+    return [
+        (record.scenario, TRACK),
+        (f"policy {record.policy}", TRACK),
+        (f"{record.ended} after {time_s:.0f} s", TRACK),
+        (f"RC {measures.get('route_completion') or 0.0:.2f}", TRACK),
+        (f"failures {measures.get('failures') or 0.0:.0f}", TRACK),
+        ("route", ROUTE),
+        ("track", TRACK),
+        ("barriers", BARRIER),
+        ("people", PERSON),
+        ("events", EVENT),
+        *([("residents", RESIDENT)] if scenario.crowd.residents else []),
+    ]

@@ -1,13 +1,13 @@
-"""What is written over a film: panels, figures, captions of events and failures."""
+"""How a film is laid out, and what is written in it: panels, figures, captions of events and failures."""
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import cv2
 import numpy as np
 
-from cosim.report.above import Colour, Image
+from cosim.report.legend import Colour, Image
 
 INK: Final[Colour] = (245, 245, 245)
 QUIET: Final[Colour] = (190, 196, 204)
@@ -19,15 +19,50 @@ _FONT: Final = cv2.FONT_HERSHEY_DUPLEX
 _MARGIN_PX: Final = 16
 
 
-def inset(image: Image, picture: Image, corner: tuple[int, int], title: str = "") -> None:
-    """Lay a picture over the film at its top left corner (x, y), framed, with a title over its upper edge."""
-    x, y = corner
-    height, width = picture.shape[:2]
-    image[y - 2 : y + height + 2, x - 2 : x + width + 2] = 250
-    image[y : y + height, x : x + width] = picture
+class Area(NamedTuple):
+    """A part of the film in pixels: upper left corner, width, height."""
+
+    x: int
+    y: int
+    width: int
+    height: int
+
+
+class Layout(NamedTuple):
+    """Where things are in a film: the view, beside it a second view (4:3) over the map, below them all the bar."""
+
+    view: Area
+    second: Area
+    map: Area
+    bar: Area
+
+    @classmethod
+    def of(cls, width: int, height: int) -> Layout:
+        """For films of any size; nothing covers anything."""
+        bar_px = max(22, height * 44 // 720)
+        tall = height - bar_px
+        column = min(width * 3 // 10, tall * 4 // 7) // 4 * 4
+        left, upper = width - column, column * 3 // 4
+        return cls(
+            view=Area(0, 0, left, tall),
+            second=Area(left, 0, column, upper),
+            map=Area(left, upper, column, tall - upper),
+            bar=Area(0, tall, width, bar_px),
+        )
+
+
+def fill(image: Image, area: Area, picture: Image, title: str = "") -> None:
+    """Put a picture of its size into an area, with a title over its upper edge."""
+    image[area.y : area.y + area.height, area.x : area.x + area.width] = picture
+    if area.x:
+        image[area.y : area.y + area.height, area.x : area.x + 2] = 250
+    if area.y:
+        image[area.y : area.y + 2, area.x : area.x + area.width] = 250
     if title:
-        shade(image, (x, y, x + width, y + 22))
-        words(image, title, (x + 7, y + 16), 0.45, QUIET)
+        size = max(0.33, 0.45 * len(image) / 720)
+        tall = cv2.getTextSize(title, _FONT, size, 1)[0][1]
+        shade(image, (area.x, area.y, area.x + area.width, area.y + tall + 12))
+        words(image, title, (area.x + 7, area.y + tall + 6), size, QUIET)
 
 
 def shade(image: Image, area: tuple[int, int, int, int], strength: float = 0.6) -> None:
@@ -41,21 +76,24 @@ def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Col
     cv2.putText(image, text, at, _FONT, size, colour, 1, cv2.LINE_AA)
 
 
-def bar(image: Image, left: str, right: str, share: float) -> None:
-    """The bar along the lower edge: what runs, its figures, and how much of the way is done."""
-    height, width = image.shape[:2]
-    shade(image, (0, height - 40, width, height))
-    words(image, left, (_MARGIN_PX, height - 14), 0.55)
-    long = cv2.getTextSize(right, _FONT, 0.55, 1)[0][0]
-    words(image, right, (width - _MARGIN_PX - long, height - 14), 0.55)
-    image[height - 44 : height - 40, :] = 60
-    image[height - 44 : height - 40, : round(width * min(max(share, 0.0), 1.0))] = (60, 150, 250)
+def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
+    """The bar along the lower edge: what runs, its figures, and how much of the way is done. Words as large as fit."""
+    line_px = max(2, area.height // 10)
+    image[area.y :] = (18, 20, 26)
+    image[area.y : area.y + line_px] = 60
+    image[area.y : area.y + line_px, : round(area.width * min(max(share, 0.0), 1.0))] = (60, 150, 250)
+    needed = sum(cv2.getTextSize(text, _FONT, 1.0, 1)[0][0] for text in (left, right))
+    size = min(max(0.4, 0.0125 * area.height), (area.width - 3 * _MARGIN_PX) / needed)
+    long, tall = cv2.getTextSize(right, _FONT, size, 1)[0]
+    y = area.y + line_px + (area.height - line_px + tall) // 2
+    words(image, left, (_MARGIN_PX, y), size)
+    words(image, right, (area.width - _MARGIN_PX - long, y), size)
 
 
-def caption(image: Image, text: str, colour: Colour) -> None:
-    """A line in the upper middle."""
-    width = image.shape[1]
-    long, tall = cv2.getTextSize(text, _FONT, 0.9, 1)[0]
-    x = (width - long) // 2
-    shade(image, (x - 18, 22, x + long + 18, 22 + tall + 26), 0.65)
-    words(image, text, (x, 22 + tall + 12), 0.9, colour)
+def caption(image: Image, area: Area, text: str, colour: Colour) -> None:
+    """A line in the upper middle of an area."""
+    size = max(0.5, 0.9 * area.height / 676)
+    long, tall = cv2.getTextSize(text, _FONT, size, 1)[0]
+    x, y, edge = area.x + (area.width - long) // 2, area.y + tall, tall * 2 // 3
+    shade(image, (max(x - edge, 0), y - edge, x + long + edge, y + tall + edge), 0.65)
+    words(image, text, (x, y + tall), size, colour)

@@ -11,7 +11,8 @@ import shapely
 
 from cosim.errors import MapError
 from cosim.mapcheck import MapCheck
-from cosim.report.above import LEGEND_PX, TRACK, Colour, Image, Sheet, draw_streets
+from cosim.report.above import TRACK, Sheet, draw_streets
+from cosim.report.legend import Colour, Image, legend
 from cosim.streetmap import StreetMap, Strip
 
 MARGIN_M: Final = 20.0
@@ -46,9 +47,8 @@ def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, f
         marked = street_map.strips[problem.strip]
         sheet.line(marked.line[:, :2], colour, 1.0)
         sheet.dot(np.array([[problem.x_m, problem.y_m]]), colour, 4.0, filled=False)
-    _legend(sheet.image, check)
     _scale_bar(sheet, bounds)
-    return sheet.image
+    return legend(sheet.image, _facts(check))
 
 
 def write_png(image: Image, path: Path) -> None:
@@ -60,17 +60,12 @@ def write_png(image: Image, path: Path) -> None:
         raise MapError(f"{path}: cannot be written: {error.strerror}") from error
 
 
-def _legend(image: Image, check: MapCheck) -> None:
-    """One line below the picture: the figures, then what each colour means."""
-    image[-LEGEND_PX:] = 255
+def _facts(check: MapCheck) -> list[tuple[str, Colour]]:
+    """What stands below the picture: the figures, then what each colour means."""
     kinds = [kind for kind in MARKS if any(problem.kind == kind for problem in check.problems)]
     crossings = f"{check.crossings} crossings, {check.signalised} with signals"
     words = f"{check.name}  {check.walkable_km:.1f} km walkable, {crossings}"
-    cells = [(words, TRACK), *((MARKS[kind][1], MARKS[kind][0]) for kind in kinds)]
-    x = 8
-    for text, colour in cells:
-        cv2.putText(image, text, (x, len(image) - 11), cv2.FONT_HERSHEY_SIMPLEX, 0.5, colour, 1, cv2.LINE_AA)
-        x += cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, 0.5, 1)[0][0] + 24
+    return [(words, TRACK), *((MARKS[kind][1], MARKS[kind][0]) for kind in kinds)]
 
 
 def _scale_bar(sheet: Sheet, bounds: tuple[float, float, float, float]) -> None:

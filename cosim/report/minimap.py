@@ -9,67 +9,114 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.report.above import BARRIER, EVENT, PERSON, RESIDENT, ROUTE, Image, Sheet, draw_streets
+from cosim.geometry import Floats
+from cosim.report.above import BARRIER, EVENT, GROUND, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
+from cosim.report.legend import Colour, Image
 from cosim.scenario import Scenario
-from cosim.state import RobotState, Street
+from cosim.state import PERSON_RADIUS_M, People, RobotState, Street
 from cosim.streetmap import StreetMap
 
-REACH_M: Final = 28.0
-"""Metres from the robot to the border of the map."""
-ROBOT: Final = (20, 20, 20)
-VEHICLE: Final = (60, 80, 130)
-WALK: Final = (0, 170, 80)
-RED: Final = (220, 30, 30)
+REACH_M: Final = 11.0
+"""Metres from the middle of the map to its nearer borders."""
+AHEAD_M: Final = 4.0
+"""The middle of the map is so far ahead of the robot."""
+SHARPEST_PX_PER_M: Final = 16.0
+ROBOT: Final[Colour] = (20, 20, 20)
+NOSE: Final[Colour] = (90, 200, 255)
+VEHICLE: Final[Colour] = (60, 80, 130)
+WALK: Final[Colour] = (0, 170, 80)
+RED: Final[Colour] = (220, 30, 30)
+INK: Final[Colour] = (40, 40, 40)
+COLOURS: Final[dict[str, Colour]] = {"e": EVENT, "n": RESIDENT}
+"""Of people, by the first letter of their id; all others are background walkers."""
+NOSE_M: Final = 0.62
+"""From the middle of a person to the tip that shows where the body faces."""
 
 
 class Minimap:
-    """Draws the streets around a scenario's route once, and what moves on them for each picture."""
+    """Draws the streets around a scenario's route once, and what moves on them for each picture.
 
-    def __init__(self, street_map: StreetMap, scenario: Scenario) -> None:
+    footprint_m: length and width of the robot.
+    """
+
+    def __init__(self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]) -> None:
         route = np.array(scenario.route)
-        low, high = route.min(axis=0) - 2.0 * REACH_M, route.max(axis=0) + 2.0 * REACH_M
+        low, high = route.min(axis=0) - 4.0 * REACH_M, route.max(axis=0) + 4.0 * REACH_M
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-        self._sheet = Sheet(bounds)
-        draw_streets(self._sheet, street_map, shapely.box(*bounds))
-        self._sheet.line(route, ROUTE, 0.4)
+        sheet = Sheet(bounds, SHARPEST_PX_PER_M)
+        draw_streets(sheet, street_map, shapely.box(*bounds))
+        sheet.line(route, ROUTE, 0.2)
         for barrier in scenario.barriers:
             across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
             middle = np.array([barrier.x_m, barrier.y_m])
-            self._sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
-        self._sheet.dot(np.array([scenario.goal]), ROUTE, 1.0)
-        self._streets = self._sheet.image.copy()
+            sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.4)
+        sheet.dot(np.array([scenario.goal]), ROUTE, 0.7)
+        sheet.dot(np.array([scenario.goal]), (255, 255, 255), 0.3)
+        self._streets, self._footprint = sheet, np.array(footprint_m)
         self._lights = {c.id: street_map.strips[c.id].line[:, :2] for c in scenario.crossings if c.signalised}
 
-    def picture(self, robot: RobotState, street: Street, side_px: int) -> Image:
-        """(side_px, side_px, 3) uint8 RGB."""
-        sheet = self._sheet
-        sheet.image = self._streets.copy()
-        for i in range(len(street.vehicles)):
-            sheet.area(
-                shapely.Polygon(_box(street.vehicles.xy[i], street.vehicles.heading[i], street.vehicles.size[i])),
-                VEHICLE,
-            )
+    def picture(self, robot: RobotState, street: Street, size_px: tuple[int, int], ahead: Floats) -> Image:
+        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows more.
+
+        People have a nose where they face; those of events are orange, residents green; a hand held up to the robot
+        is red. A word says what event people do.
+        """
+        width, height = size_px
+        half_m = REACH_M * np.array([width, height]) / min(width, height)
+        middle = robot.pose.xy + AHEAD_M * ahead / np.hypot(*ahead)
+        (x0, y0), (x1, y1) = (middle - half_m).tolist(), (middle + half_m).tolist()
+        sheet = Sheet((x0, y0, x1, y1), max(width, height) / (2.0 * half_m.max()))
+        sheet.image = self._ground(x0, y1, sheet.px_per_m, size_px)
         for crossing, line in self._lights.items():
             if crossing in street.signals:
-                sheet.line(line, WALK if street.signals[crossing].walk else RED, 0.5)
-        people = street.people
-        kinds = np.array([name[0] for name in people.ids], dtype=str)
-        sheet.dot(people.xy[(kinds != "e") & (kinds != "n")], PERSON, 0.45)
-        sheet.dot(people.xy[kinds == "n"], RESIDENT, 0.45)
-        sheet.dot(people.xy[kinds == "e"], EVENT, 0.55)
-        nose = _box(robot.pose.xy, robot.pose.heading_rad, np.array([2.4, 1.6]))
-        sheet.area(shapely.Polygon([(nose[0] + nose[1]) / 2, nose[2], nose[3]]), ROBOT)
-        corners = sheet.px(robot.pose.xy + np.array([[-REACH_M, REACH_M], [REACH_M, -REACH_M]])) // 16
-        (x0, y0), (x1, y1) = corners.tolist()
-        height, width = sheet.image.shape[:2]
-        x0, y0, x1, y1 = max(x0, 0), max(y0, 0), min(x1, width), min(y1, height)
-        if x1 - x0 < 2 or y1 - y0 < 2:
-            return np.full((side_px, side_px, 3), 128, dtype=np.uint8)
-        cut: Image = cv2.resize(sheet.image[y0:y1, x0:x1], (side_px, side_px), interpolation=cv2.INTER_AREA)
-        return cut
+                sheet.line(line, WALK if street.signals[crossing].walk else RED, 0.4)
+        for xy, heading, size_m in zip(street.vehicles.xy, street.vehicles.heading, street.vehicles.size, strict=True):
+            sheet.area(shapely.Polygon(_box(xy, heading, size_m)), VEHICLE)
+        _draw_people(sheet, street.people)
+        body = _box(robot.pose.xy, robot.pose.heading_rad, self._footprint)
+        sheet.area(shapely.buffer(shapely.Polygon(body), 0.15), (255, 255, 255))
+        sheet.area(shapely.Polygon(body), ROBOT)
+        tip = robot.pose.xy + 0.5 * (body[0] + body[1] - 2.0 * robot.pose.xy)
+        sheet.area(shapely.Polygon([tip, 0.5 * (body[0] + body[3]), 0.5 * (body[1] + body[2])]), NOSE)
+        return sheet.image
+
+    def _ground(self, x0: float, y1: float, px_per_m: float, size_px: tuple[int, int]) -> Image:
+        """The streets of the part whose upper left corner is at metres x0, y1."""
+        streets = self._streets
+        left, upper = (streets.px(np.array([[x0, y1]]))[0] / 16.0).tolist()
+        zoom = streets.px_per_m / px_per_m
+        onto = np.array([[zoom, 0.0, left], [0.0, zoom, upper]])
+        how = cv2.INTER_AREA if zoom > 1.0 else cv2.INTER_LINEAR
+        ground: Image = cv2.warpAffine(
+            streets.image, onto, size_px, flags=how | cv2.WARP_INVERSE_MAP, borderValue=GROUND
+        ).astype(np.uint8)
+        return ground
 
 
-def _box(xy: np.ndarray, heading_rad: float, size_m: np.ndarray) -> np.ndarray:
+def _draw_people(sheet: Sheet, people: People) -> None:
+    """Everybody with a nose; event people over the others, with what they do."""
+    event = np.array([name.startswith("e") for name in people.ids], dtype=bool)
+    ahead = np.column_stack([np.cos(people.heading), np.sin(people.heading)])
+    for row in np.argsort(event, kind="stable").tolist():
+        xy, way = people.xy[row], ahead[row]
+        colour = COLOURS.get(people.ids[row][0], PERSON)
+        aside = 0.8 * PERSON_RADIUS_M * np.array([-way[1], way[0]])
+        nose = shapely.Polygon([xy + NOSE_M * way, xy + aside, xy - aside])
+        body = shapely.MultiPolygon([shapely.Point(*xy).buffer(PERSON_RADIUS_M), nose])
+        for part in body.geoms:
+            sheet.area(part.buffer(0.09), INK)
+        sheet.area(body, colour)
+        if people.doing[row] == "stop":
+            hand = np.array([xy + (NOSE_M + 0.1) * way + 2.0 * aside, xy + (NOSE_M + 0.1) * way - 2.0 * aside])
+            sheet.line(hand, RED, 0.25)
+    doing = np.array(people.doing)
+    for word in dict.fromkeys(doing[event].tolist()):
+        if word not in ("walk", "stand"):
+            middle = people.xy[event & (doing == word)].mean(axis=0)
+            sheet.text(middle.tolist(), word, INK, 1.1, 0.38)
+
+
+def _box(xy: Floats, heading_rad: float, size_m: Floats) -> Floats:
     """(4, 2) corners of a box: fore left, fore right, aft right, aft left."""
     along = 0.5 * size_m[0] * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     aside = 0.5 * size_m[1] * np.array([-math.sin(heading_rad), math.cos(heading_rad)])

@@ -44,7 +44,7 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
     arms = GESTURES[name](bends)
     turns = rodrigues(bends)
     pelvis = np.column_stack([np.zeros(FRAMES), 0.014 * scale * shift, np.zeros(FRAMES)])
-    pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.012 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
+    pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.004 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
     for side, (upper, fore, fingers, thumb) in arms.items():
         set_arm(turns, side, *(np.broadcast_to(v, (FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
     if name == "sit":
@@ -118,18 +118,23 @@ def _looking(bends: Floats) -> dict[str, Arm]:
 
 
 def _talking(bends: Floats) -> dict[str, Arm]:
-    """Speaks with both hands, the right one livelier, and nods."""
+    """Speaks for half of the time, elbows at the sides, both hands before the chest, the right one livelier; then
+    listens with the hands low, and nods."""
+    speaks = 0.5 + 0.5 * np.tanh(3.0 * np.sin(_PHASE)) / np.tanh(3.0)
     beat = 0.6 * np.sin(5.0 * _PHASE) + 0.4 * np.sin(8.0 * _PHASE + 1.0)
     other = 0.6 * np.sin(4.0 * _PHASE + 2.0) + 0.4 * np.sin(7.0 * _PHASE)
-    _bend(bends, "head", 0.05 * other, 0.08 * np.sin(6.0 * _PHASE), 0.18 * np.sin(2.0 * _PHASE))
+    nod = 0.04 * speaks * other + 0.09 * (1.0 - speaks) * np.sin(6.0 * _PHASE)
+    _bend(bends, "head", 0.05 * speaks * other, 0.03 + nod, 0.22 * np.sin(2.0 * _PHASE))
     _bend(bends, "spine3", 0.0, 0.0, 0.06 * np.sin(_PHASE))
     o = np.zeros(FRAMES)
     arms: dict[str, Arm] = {}
-    for side, left, swing in (("left", 1.0, other), ("right", -1.0, beat)):
-        upper = np.column_stack([o + 0.30 + 0.08 * swing, left * (0.28 + 0.06 * swing), o - 1.0])
-        fore = np.column_stack([o + 1.0, left * (0.02 + 0.30 * swing), 0.10 + 0.45 * swing])
-        fingers = fore + np.column_stack([o, -0.25 * left * (1.0 + swing), 0.15 + 0.2 * swing])
-        arms[side] = (upper, fore, fingers, np.column_stack([o, o + 0.45 * left, o + 1.0]))
+    for side, left, swing in (("left", 1.0, 0.7 * other), ("right", -1.0, beat)):
+        lively = speaks * swing
+        upper = np.column_stack([o - 0.04 + 0.16 * speaks + 0.08 * lively, left * (0.22 + 0.06 * lively), o - 1.0])
+        rise = -0.75 + speaks * (1.15 + 0.55 * swing)
+        fore = np.column_stack([o + 0.80, left * (-0.32 + 0.24 * speaks + 0.30 * lively), rise])
+        fingers = fore + np.column_stack([o, -0.15 * left * speaks, 0.15 * speaks + 0.2 * lively])
+        arms[side] = (upper, fore, fingers, np.column_stack([o + 0.3 * (1.0 - speaks), o + 0.45 * left, o + 1.0]))
     return arms
 
 

@@ -1,0 +1,68 @@
+"""The band below a picture: what it shows and what its colours mean, on as many lines as that takes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Colour = tuple[int, int, int]
+Image = NDArray[np.uint8]
+
+LINE_PX: Final = 22
+MARGIN_PX: Final = 8
+GAP_PX: Final = 24
+"""Between two cells of a line."""
+_FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
+_SIZE: Final = 0.5
+
+
+def legend(image: Image, cells: Sequence[tuple[str, Colour]]) -> Image:
+    """The picture, (H, W, 3) uint8 RGB, with a white band below it that holds every cell: words and their colour.
+
+    A cell that no longer fits into a line begins the next one; one that is wider than the picture breaks at blanks.
+    """
+    lines = _lines(cells, image.shape[1])
+    band: Image = np.full((LINE_PX * len(lines) + 2 * MARGIN_PX, image.shape[1], 3), 255, dtype=np.uint8)
+    for row, line in enumerate(lines):
+        x, y = MARGIN_PX, MARGIN_PX + LINE_PX * row + 16
+        for words, colour in line:
+            cv2.putText(band, words, (x, y), _FONT, _SIZE, colour, 1, cv2.LINE_AA)
+            x += wide_px(words) + GAP_PX
+    return np.concatenate([image, band])
+
+
+def wide_px(words: str, size: float = _SIZE) -> int:
+    """How long a line of words is."""
+    return int(cv2.getTextSize(words, _FONT, size, 1)[0][0])
+
+
+def _lines(cells: Sequence[tuple[str, Colour]], width_px: int) -> list[list[tuple[str, Colour]]]:
+    """The cells in lines that are no wider than the picture, unless a single word is."""
+    room = width_px - 2 * MARGIN_PX
+    lines: list[list[tuple[str, Colour]]] = [[]]
+    left = room
+    for words, colour in cells:
+        for piece in _pieces(words, room):
+            needed = wide_px(piece)
+            if needed > left and lines[-1]:
+                lines.append([])
+                left = room
+            lines[-1].append((piece, colour))
+            left -= needed + GAP_PX
+    return lines
+
+
+def _pieces(words: str, room_px: int) -> list[str]:
+    """A cell, broken at blanks into pieces that fit into a line."""
+    pieces = [""]
+    for word in words.split():
+        longer = f"{pieces[-1]} {word}".strip()
+        if pieces[-1] and wide_px(longer) > room_px:
+            pieces.append(word)
+        else:
+            pieces[-1] = longer
+    return pieces
