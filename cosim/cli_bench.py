@@ -27,13 +27,14 @@ def bench(
         int | None, typer.Option(min=1, help="How many cities: 3 for `crowd`, 20 for `crossings` unless you say.")
     ] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="For `crowd`: simulated minutes in each.")] = 10.0,
+    residents: Annotated[int, typer.Option(min=0, help="For `crowd`: residents beside the crowd.")] = 0,
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
     jobs: Annotated[int, typer.Option(min=1, help="For `crossings`: environment processes.")] = 1,
 ) -> None:
     """Measure one environment process, part by part, the cameras, or what robot, people and vehicles do in traffic."""
     if what == "crowd":
-        bench_crowd(3 if cities is None else cities, minutes)
+        bench_crowd(3 if cities is None else cities, minutes, residents)
         return
     if what == "crossings":
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)

@@ -35,13 +35,14 @@ SHARES = (
 """What is counted, of what, and the target."""
 
 
-def bench_crowd(cities: int, minutes: float) -> None:
+def bench_crowd(cities: int, minutes: float, residents: int = 0) -> None:
     """Watch the crowd of several cities and print how people keep apart, out of things and to the lights."""
     from cosim.scenario import CrowdSpec
     from scenarios.bench_crowd import summed, watch_all
 
     with err.status("watching ...") as status:
-        found = watch_all(cities, minutes, CrowdSpec(), lambda words: status.update(f"watching: {words}"))
+        crowd = CrowdSpec(residents=residents)
+        found = watch_all(cities, minutes, crowd, lambda words: status.update(f"watching: {words}"))
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
     places = f"{len(found)} cities, {total_min:.0f} min, {sum(f.crossings for f in found)} signalised crossings entered"

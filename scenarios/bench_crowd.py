@@ -37,6 +37,7 @@ from scenarios.barriers import fenced
 from scenarios.behaviors import react
 from scenarios.crowd_tally import Tally
 from scenarios.long_horizon import build
+from scenarios.residents.director import among_residents
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.stoplines import StopLines
 
@@ -142,7 +143,8 @@ def drive(scenario: Scenario, street_map: StreetMap, limit_ticks: int) -> tuple[
     ticks = persons = 0
     with crowd:
         timed = Stopwatch(crowd)
-        parts = Parts(Glider(footprint_m), timed, Directly(), Route(), None, Limits(), free)
+        director = among_residents(Directly(), scenario, street_map, ground, lambda: crowd.street.people)
+        parts = Parts(Glider(footprint_m), timed, director, Route(), None, Limits(), free)
         lines = StopLines(clock.tick_s)
         run = steps(scenario, clock, parts)
         step = next(run)

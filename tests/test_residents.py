@@ -18,6 +18,7 @@ from shapely.geometry import LineString, Point
 
 from cosim.errors import SpecError
 from cosim.events import EventQuery, EventReply
+from cosim.gait import Strides
 from cosim.geometry import Floats, Polyline, wrap_angle
 from cosim.scenario import Barrier, City, CrowdSpec, Scenario, content_hash
 from cosim.state import NOBODY, PERSON_RADIUS_M, People
@@ -25,6 +26,8 @@ from cosim.streetmap import Lane, StreetMap, Strip
 from physics.furniture import footprints
 from physics.ground import Ground
 from physics.pastimes import spots
+from physics.people.clips import own_clips
+from physics.people.poses import poses
 from physics.placement import CLEAR_HALF_M
 from physics.tiles import key_at
 from scenarios.barriers import outline
@@ -220,6 +223,28 @@ def test_a_resident_walks_idles_and_does_something() -> None:
                 spot = one.graph.spot(one_of.goal)
                 assert spot is not None and one_of.heading_rad == spot.heading_rad
                 assert (one_of.x_m, one_of.y_m) == (spot.x_m, spot.y_m)
+
+
+def test_who_sits_down_and_gets_up_does_not_jump() -> None:
+    """From walking to sitting and back no joint's matrix changes by 0.55 in a tick: a jump would be 1 or more."""
+    one, clips, strides = town(*CITIES[1]), own_clips(), Strides(TICK_MS / 1000)
+    moments = lived(one, 240.0, v_mps=0.1)
+    sat = {r.number for m in moments for r in m.residents if r.doing == "sit" and r.phase == "interacting"}
+    walked = {r.number for m in moments for r in m.residents if r.phase == "walking"}
+    name = f"n{min(sat & walked)}"
+    before, largest, did = None, 0.0, set()
+    for moment in moments:
+        row = np.array([i for i, who in enumerate(moment.people.ids) if who == name], dtype=np.intp)
+        person = moment.people.only(row)
+        counted = strides.update(person.ids, person.xy, person.speed)
+        person = People.of(person.ids, person.xy, person.heading, person.speed, person.doing, *counted)
+        did |= set(person.doing)
+        now = poses(person, moment.query.tick * TICK_MS / 1000, clips).matrices(clips)
+        if before is not None and len(now) and len(before):
+            largest = max(largest, float(np.abs(now[..., :3] - before[..., :3]).max()))
+        before = now
+    assert {"walk", "sit"} <= did
+    assert largest < 0.55
 
 
 def test_residents_keep_out_of_things_people_and_the_robot() -> None:

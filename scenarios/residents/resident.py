@@ -40,9 +40,9 @@ GIVES_UP_S: Final = 3.0
 """Who makes no way for so long goes elsewhere."""
 TREADS_MPS: Final = 0.25
 """What a body shows that turns on the spot: `cosim.gait` blends from it into what it does next."""
-RISE_S: Final = 0.5
-RISES_MPS: Final = 0.6
-"""How long it takes to get up, and the pace that the body shows by then."""
+LEAVES_S: Final = 0.55
+"""How long a body takes from what it did, such as sitting, to the pose in which it treads; it stays where it is."""
+LEAVES_MPS: Final = 0.3
 _ABOUT: Final[tuple[Doing, ...]] = ("stand", "look", "phone")
 _FACES_RAD: Final = 0.02
 _DETOURS_RAD: Final = (0.0, 0.4, -0.4, 0.8, -0.8, 1.2, -1.2)
@@ -92,7 +92,7 @@ def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
     """Whether it is done here, or makes no way."""
     if resident.phase == "walking":
         return resident.blocked_ticks * query.tick_ms / 1000 >= GIVES_UP_S
-    return resident.since_tick is not None and _here_s(resident, query) >= resident.stay_s + _rise_s(resident)
+    return _here_s(resident, query) >= resident.stay_s + LEAVES_S
 
 
 def chosen(resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]) -> Resident:
@@ -153,8 +153,8 @@ def advanced(resident: Resident, graph: BehaviorGraph, query: EventQuery, neighb
         return _walked(resident, graph, query, neighbours)
     if resident.since_tick is None:
         return _turned(resident, graph, query)
-    rises = _rise_s(resident) > 0.0 and _here_s(resident, query) >= resident.stay_s
-    return resident._replace(shown_mps=RISES_MPS if rises else 0.0)
+    leaves = _here_s(resident, query) >= resident.stay_s
+    return resident._replace(shown_mps=LEAVES_MPS if leaves else 0.0)
 
 
 def arrived(resident: Resident, graph: BehaviorGraph) -> Resident:
@@ -254,8 +254,4 @@ def _nearer(at: Vector, onward: Vector, one: Neighbour) -> bool:
 
 
 def _here_s(resident: Resident, query: EventQuery) -> float:
-    return 0.0 if resident.since_tick is None else (query.tick - resident.since_tick) * query.tick_ms / 1000
-
-
-def _rise_s(resident: Resident) -> float:
-    return RISE_S if resident.doing == "sit" else 0.0
+    return -math.inf if resident.since_tick is None else (query.tick - resident.since_tick) * query.tick_ms / 1000
