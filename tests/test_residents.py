@@ -318,8 +318,7 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     from cosim.policies.load import load_policy
     from cosim.referee import Verdict
     from cosim.step import Step
-    from scenarios.counterfactual import counterfactual
-    from scenarios.replay import Recorded
+    from scenarios.replay import Recorded, compared
     from scenarios.run import episode
 
     whole = with_residents(suite("long-horizon"), 6)
@@ -332,5 +331,5 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     outcome = episode(scenario, load_policy("orca"), watch=watch)
     assert outcome.log is not None and outcome.record.status == "done", outcome.record.reason
     assert len(names) >= 6 and outcome.log.people_resident.any()
-    compared = counterfactual(Recorded(scenario, outcome.record, outcome.log))
-    assert compared.state_hash == outcome.record.state_hash
+    state_hash, without = compared(Recorded(scenario, outcome.record, outcome.log))
+    assert state_hash == outcome.record.state_hash and without.people.compared > 0

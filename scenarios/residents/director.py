@@ -22,6 +22,7 @@ from cosim.state import People
 from cosim.steering import NEAR_M, Neighbour
 from cosim.streetmap import StreetMap
 from physics.ground import Ground
+from scenarios.behaviors.sight import SHARED, STILL_MPS
 from scenarios.residents.graph import BehaviorGraph, behavior_graph
 from scenarios.residents.resident import (
     SPEED_MPS,
@@ -155,7 +156,8 @@ def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neigh
         if people.ids[i] != walking[k].name:
             moving = _velocity(float(people.speed[i]), float(people.heading[i]))
             x, y = people.xy[i].tolist()
-            one = Neighbour(x, y, *moving, 0.5 if people.ids[i][0] == "n" else 1.0)
+            steers = people.ids[i][0] in "en" and people.speed[i] > STILL_MPS
+            one = Neighbour(x, y, *moving, SHARED if steers else 1.0)
             found[walking[k].number].append((float(square[k, i]), one))
     return {number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]] for number, near in found.items()}
 
