@@ -27,15 +27,19 @@ VEHICLE_MARGIN_M: Final = 6.0
 PROP_MARGIN_M: Final = 2.5
 SIDE_MAX: Final = 4096
 FOV_DEG: Final = (5.0, 150.0)
+_MOUNT_M: Final = 3.0
+"""No robot carries its camera higher above the ground."""
 
 
 @dataclass(frozen=True, slots=True)
 class View:
-    """The wedge of ground that a picture shows. eye_m: (3,); heading_rad; half_angle_rad: half its width."""
+    """The wedge of ground that a picture shows. eye_m: (3,); heading_rad; half_angle_rad: half its width; behind_m: how
+    far behind the eye a picture from above reaches."""
 
     eye_m: Floats
     heading_rad: float
     half_angle_rad: float
+    behind_m: float = 0.0
 
     def rows(self, xy: Floats, margin_m: float) -> NDArray[np.intp]:
         """Which of (N, 2) points can be in the picture, things of radius `margin_m` standing on them."""
@@ -46,8 +50,9 @@ class View:
         offset = xy - self.eye_m[:2]
         cos, sin = math.cos(self.heading_rad), math.sin(self.heading_rad)
         ahead, aside = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
-        wide = aside * math.cos(self.half_angle_rad) - ahead * math.sin(self.half_angle_rad)
-        seen = (wide < margin_m) & (ahead > -margin_m)
+        inner = ahead + self.behind_m if self.behind_m else ahead
+        wide = aside * math.cos(self.half_angle_rad) - inner * math.sin(self.half_angle_rad)
+        seen = (wide < margin_m) & (inner > -margin_m)
         return np.asarray(seen if math.isinf(reach_m) else seen & (np.hypot(ahead, aside) < reach_m))
 
 
@@ -81,7 +86,11 @@ class Shot:
         half_up = math.radians(0.5 * self.fov_deg)
         lowest = max(math.cos(abs(self.steep_rad) + half_up), 0.05)
         half_wide = math.atan(math.tan(half_up) * self.size[0] / self.size[1] / lowest)
-        return View(self.eye_m, math.atan2(ahead[1], ahead[0]), half_wide)
+        heading_rad = math.atan2(ahead[1], ahead[0]) if math.hypot(ahead[0], ahead[1]) > 0.0 else 0.5 * math.pi
+        past_rad = self.steep_rad + half_up - 0.5 * math.pi
+        if past_rad <= 0.0:
+            return View(self.eye_m, heading_rad, half_wide)
+        return View(self.eye_m, heading_rad, 0.5 * math.pi, max(-ahead[2], _MOUNT_M) * math.tan(past_rad))
 
     @cached_property
     def axes(self) -> Floats:
