@@ -1,7 +1,8 @@
 """Paint and tactile paving: what lies on the ground without changing what the ground is.
 
 Lines between lanes and between the directions of a road, stop lines before signalised crossings, and fields of domes
-where a crossing begins. They belong to the tile of their middle and follow its heights.
+where a crossing begins. Lines belong to the tile of their middle and follow its heights; domes lie in the triangles of
+the ground, of whichever tile.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import Lane, StreetMap, Strip
 from physics.mesh import EMPTY, Mesh, join
-from physics.tiles import Tile, key_at, square
+from physics.tiles import Tile, key_at, kind_of, square
 
 LINE_M: Final = 0.12
 STOP_LINE_M: Final = 0.40
@@ -33,6 +34,8 @@ _STOP_WITHIN_M: Final = 12.0
 _TACTILE_BEHIND_M: Final = 0.25
 _LIFT_M: Final = 0.004
 _REACH_M: Final = 8.0
+_WALKED_ON: Final = ("sidewalk", "ramp", "curb")
+"""Kinds of ground that domes lie on."""
 
 
 def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
@@ -129,21 +132,38 @@ def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
 
 
 def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
-    """Domes at both ends of the crossings, on walkable ground only."""
-    meshes = []
-    for crossing in crossings:
-        for line in (crossing.line, crossing.line[::-1]):
-            field = _field(street_map, Polyline(line), crossing.width_m)
-            middle = shapely.centroid(field)
-            if shapely.is_empty(field) or key_at(shapely.get_x(middle), shapely.get_y(middle)) != tile.key:
-                continue
-            pieces = shapely.constrained_delaunay_triangles(shapely.segmentize(field, 0.5))
-            xy = shapely.get_coordinates(shapely.get_parts(pieces)).reshape(-1, 4, 2)[:, :3]
-            one, two = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
-            under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
-            xy[under] = xy[under][:, ::-1]
-            meshes.append(_on_ground(xy.reshape(-1, 2), np.arange(3 * len(xy)).reshape(-1, 3), tile))
-    return join(meshes)
+    """Domes at both ends of the crossings, on walkable ground only: what of them lies on the tile."""
+    border = shapely.box(*square(tile.key))
+    ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
+    fields = [_field(street_map, Polyline(line), width_m) for line, width_m in ends]
+    here = [field for field in fields if shapely.intersects(field, border)]
+    if not here:
+        return EMPTY
+    walked = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKED_ON])
+    return join([_draped(field, walked) for field in here])
+
+
+def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
+    """A field cut along the triangles of the ground under it, so that it lies in them; 4 mm above."""
+    faces = ground.vertices[ground.triangles]
+    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    x0, y0, x1, y1 = shapely.bounds(field)
+    low, high = faces[:, :, :2].min(axis=1), faces[:, :, :2].max(axis=1)
+    near = (normal[:, 2] > 1e-9) & ((low < (x1, y1)) & (high > (x0, y0))).all(axis=1)
+    faces, normal = faces[near], normal[near]
+    pieces = shapely.intersection(shapely.polygons(faces[:, :, :2]), field)
+    own = shapely.area(pieces) > 1e-6
+    faces, normal = faces[own], normal[own]
+    cut, of = shapely.get_parts(shapely.constrained_delaunay_triangles(pieces[own]), return_index=True)
+    xy = shapely.get_coordinates(cut).reshape(-1, 4, 2)[:, :3]
+    one, two = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
+    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
+    xy[under] = xy[under][:, ::-1]
+    slope = normal[of, None, :2] / normal[of, None, 2:]
+    z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
+    vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)
+    up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
+    return Mesh(vertices, up, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
 
 
 def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
