@@ -70,13 +70,15 @@ class Guests:
             self._coming = [entry for entry in self._coming if entry.tick > query.tick]
             self._log += due
             self._next_tick = query.tick + 1
+            before, new = self._here, {entry.injection.id: arriving(entry) for entry in due}
+            self._here = before | new
         reply = self._director.react(query)
         here = {}
-        for name, guest in self._here.items():
+        for name, guest in before.items():
             after = advanced(guest, query)
             if after is not None:
                 here[name] = after
-        here |= {entry.injection.id: arriving(entry) for entry in due}
+        here |= new
         with self._lock:
             self._here = here
         if not here:

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import msgspec
 import pytest
@@ -119,6 +123,21 @@ def test_a_flood_is_bounded() -> None:
     assert len(one.react(query(0)).actors) == MOST_GUESTS
 
 
+def test_those_who_enter_count_while_the_director_is_asked() -> None:
+    """An offer that comes in between finds the street as full as it is about to be."""
+    acks: list[Ack] = []
+
+    class Slow(Nobody):
+        def react(self, query: EventQuery) -> EventReply:
+            acks.append(one.offer(anna(id="late")))
+            return super().react(query)
+
+    one = Guests(Slow(), TICK_MS, lambda x, y: True)
+    assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_GUESTS))
+    assert len(one.react(query(0)).actors) == MOST_GUESTS
+    assert acks[0].status == "refused" and "are here already" in acks[0].reason
+
+
 def test_a_guest_does_not_walk_through_the_robot() -> None:
     """With the robot on its path it goes round and arrives."""
     one = guests()
@@ -130,9 +149,116 @@ def test_a_guest_does_not_walk_through_the_robot() -> None:
     assert min(gaps) > 0.2 and actor.x_m == pytest.approx(99.0)
 
 
-@pytest.mark.engine
-def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path) -> None:
-    """`cosim inject` beside `cosim run --live`; `cosim replay` comes to the same state hash, given the injection."""
+SLOW = """
+import time
+from pathlib import Path
+from cosim.ports import CameraSpec, Manifest
+from cosim.state import Command
+
+class Slow:
+    manifest = Manifest("slow", rate_hz=20.0, camera=CameraSpec(64, 64))
+    def reset(self, scenario_id, seed):
+        pass
+    def act(self, observation):
+        if Path("enough").exists():
+            return Command(1.5, 0.6)  # off the sidewalk: that ends the episode
+        time.sleep(0.02)
+        return Command(0.1, 0.0)
+"""
+
+CONNECTED = """
+import json, sys, threading, zenoh
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+"""
+
+LISTENER = """
+ended, heard = threading.Event(), {}
+def hear(sample):
+    topic = str(sample.key_expr).split("/")[-1]
+    heard.setdefault(topic, []).append(json.loads(sample.payload.to_string()))
+    if topic == "events" and any(news.startswith("ended") for news in heard["events"][-1]):
+        ended.set()
+with zenoh.open(config) as session:
+    subscriber = session.declare_subscriber("cosim/**", hear)
+    print("listening", flush=True)
+    ended.wait(60)
+print(json.dumps(heard))
+"""
+
+VANDAL = """
+below, (x, y) = sys.argv[2], json.loads(sys.argv[3])
+done = threading.Semaphore(0)
+acks = []
+with zenoh.open(config) as session:
+    def ask(key, payload=b""):
+        return next(((r.ok or r.err).payload.to_bytes() for r in session.get(key, payload=payload, timeout=20)), b"")
+    def said(message, key=f"{below}/inject"):
+        return ask(key, message).decode(errors="replace")
+    bad = {
+        "10 MB": said(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
+        "10 MB of nothing": said(bytes(10_000_000)),
+        "NaN": said(b'{"id":"a","path":[[1,NaN]]}'),
+        "outside": said(b'{"id":"a","path":[[1e6,0]]}'),
+        "too fast": said(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
+        "twice": said(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
+        "every run": said(b"{}", "cosim/*/env/*/inject"),
+        "wrong run": said(b"{}", "cosim/other/env/t-0/inject"),
+    }
+    many = 2000
+    for i in range(many):
+        message = json.dumps({"id": f"p{i}", "path": [[x, y]]})
+        took = zenoh.handlers.Callback(lambda r: acks.append(json.loads(r.ok.payload.to_string())), drop=done.release)
+        session.get(f"{below}/inject", took, payload=message, timeout=60)
+    for _ in range(many):
+        done.acquire()
+    bad["flood"] = [len(acks), sum(ack["status"] == "accepted" for ack in acks)]
+    bad["log"] = json.loads(ask(f"{below}/log"))
+    bad["camera"] = ask(f"{below}/camera").hex()[:16]
+print(json.dumps(bad))
+"""
+
+
+class OnAir(NamedTuple):
+    """A run on the air in a folder. way: points on its sidewalk."""
+
+    run: subprocess.Popen[str]
+    folder: Path
+    at: str
+    way: list[tuple[float, float]]
+
+    def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            [sys.executable, *arguments], cwd=self.folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=100
+        )
+
+    def cosim(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        return self.python("-m", "cosim", *arguments)
+
+    def until(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """What a command says once it succeeds: the run may have to start first."""
+        for _ in range(60):
+            said = self.python(*arguments)
+            if said.returncode == 0:
+                break
+            time.sleep(0.3)
+        assert said.returncode == 0, said.stderr
+        return said
+
+    def record(self) -> dict[str, Any]:
+        """The record, when the episode has been told to end."""
+        (self.folder / "enough").touch()
+        assert self.run.wait(timeout=60) == 0
+        return json.loads((self.folder / "run" / "episodes" / "t-0" / "record.json").read_bytes())
+
+
+ENVIRONMENT = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
+
+
+@contextmanager
+def on_air(folder: Path) -> Iterator[OnAir]:
+    """`cosim run --live` of an episode that lasts until it is told to end."""
     from scenarios.assemble import place
     from scenarios.long_horizon import build
 
@@ -140,58 +266,78 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     _, street_map = place(city)
     whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
-    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=60.0)
-    write_suite(Suite(name="tiny", version="1", scenarios=(short,)), tmp_path / "tiny.json")
-    (tmp_path / "slow.py").write_text(
-        "import time\n"
-        "from cosim.ports import Manifest\n"
-        "from cosim.state import Command\n"
-        "class Slow:\n"
-        "    manifest = Manifest('slow', rate_hz=20.0, camera=None)\n"
-        "    def reset(self, scenario_id, seed): pass\n"
-        "    def act(self, observation):\n"
-        "        time.sleep(0.02)\n"
-        "        return Command(0.3, 0.0)\n"
-    )
-    air = f"unixsock-stream/{tmp_path}/air.sock"
-    x, y = whole.route[20]
-    words = [sys.executable, "-m", "cosim"]
-    environment = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
-    run = subprocess.Popen(
-        [*words, "run", "tiny.json", "--policy", "slow:Slow", "--out", "run", "--live", air],
-        cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True,
-    )  # fmt: skip
+    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=120.0, ends_on_failure=True, events=())
+    write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
+    (folder / "slow.py").write_text(SLOW)
+    at = f"unixsock-stream/{folder}/air.sock"
+    words = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "slow:Slow", "--camera", "bullet"]
+    with subprocess.Popen([*words, "--out", "run", "--live", at], cwd=folder, env=ENVIRONMENT, text=True) as run:
+        try:
+            yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
+        finally:
+            run.kill()
 
-    def cosim(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [*words, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
-        )
 
-    try:
-        message = json.dumps({"id": "anna", "path": [[x, y], list(whole.route[25])], "doing": "stop"})
-        for _ in range(30):
-            sent = cosim("inject", message, "--connect", air)
-            if sent.returncode == 0:
-                break
-            time.sleep(0.5)
-        assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
-        again = cosim("inject", message, "--connect", air)
+@pytest.mark.engine
+def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path) -> None:
+    """`cosim inject` beside `cosim run --live`; `cosim replay` comes to the same state hash, given the injection."""
+    with on_air(tmp_path) as air:
+        message = json.dumps({"id": "anna", "path": [air.way[0], air.way[-1]], "doing": "stop"})
+        sent = air.until("-m", "cosim", "inject", message, "--connect", air.at)
+        assert "'anna' enters at tick" in sent.stdout
+        again = air.cosim("inject", message, "--connect", air.at)
         assert again.returncode == 1 and "of this id" in again.stderr
-        elsewhere = cosim("inject", message, "--connect", air, "--env", "run/t-9")
+        elsewhere = air.cosim("inject", message, "--connect", air.at, "--env", "run/t-9")
         assert elsewhere.returncode == 2 and "Valid choices: run/t-0" in elsewhere.stderr
-        told = cosim("listen", "events", "--connect", air, "--seconds", "0.5")
+        told = air.cosim("listen", "events", "--connect", air.at, "--seconds", "0.5")
         assert json.loads(told.stdout.splitlines()[0])["injections"][0]["injection"]["id"] == "anna"
-        heard = cosim("listen", "robot", "--connect", air, "--seconds", "1")
+        heard = air.cosim("listen", "robot", "--connect", air.at, "--seconds", "1")
         assert len(heard.stdout.splitlines()) > 3 and "x_m" in json.loads(heard.stdout.splitlines()[0])
-        run.wait(timeout=180)
-    finally:
-        run.kill()
-        run.wait()
-    record = json.loads((tmp_path / "run" / "episodes" / "t-0" / "record.json").read_bytes())
+        record = air.record()
     assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
-    replayed = cosim("replay", "run", "t-0")
+    replayed = air.cosim("replay", "run", "t-0")
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
     without = json.dumps(record | {"injections": []})
     (tmp_path / "run" / "episodes" / "t-0" / "record.json").write_text(without)
-    differs = cosim("replay", "run", "t-0")
+    differs = air.cosim("replay", "run", "t-0")
     assert differs.returncode == 1 and "not the same" in differs.stderr
+
+
+@pytest.mark.engine
+def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path) -> None:
+    """The README's script injects, one who comes late hears all topics and gets the log, nonsense and floods bounce."""
+    readme = (Path(__file__).parents[1] / "README.md").read_text()
+    found = re.search(r"```python\n(import json, zenoh\n.*?)```", readme, re.DOTALL)
+    assert found is not None
+    with on_air(tmp_path) as air:
+        script = found[1].replace("tcp/127.0.0.1:7447", air.at)
+        script = script.replace("[170, 252], [190, 252]", json.dumps([air.way[0], air.way[-1]])[1:-1])
+        (tmp_path / "ten.py").write_text(script)
+        bob = json.loads(air.until("ten.py").stdout)
+        words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
+            assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
+            vandal = air.python("-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2]))
+            assert vandal.returncode == 0, vandal.stderr
+            record = air.record()
+            heard = json.loads(listener.stdout.read())
+    assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
+    said = json.loads(vandal.stdout)
+    for name, words in {
+        "10 MB": f"at most {LARGEST_B}", "10 MB of nothing": f"at most {LARGEST_B}", "NaN": "malformed",
+        "outside": "not on this map", "too fast": "at most 3, not 30", "twice": "of this id",
+        "every run": "ask for exactly 'cosim/run/env/t-0/inject'",
+    }.items():  # fmt: skip
+        assert words in said[name], said[name]
+    assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
+    answered, accepted = said["flood"]
+    assert answered == 2000 and accepted == MOST_GUESTS - 1
+    assert said["log"]["injections"][0]["injection"]["id"] == "bob"
+    assert (
+        set(heard) == {"clock", "robot", "crowd", "signals", "events"} and heard["events"][-1][-1] == "ended: failure"
+    )
+    assert heard["clock"][-1]["tick"] > bob["tick"]
+    assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)
+    assert record["status"] == "done" and len(record["injections"]) == accepted + 1
+    replayed = air.cosim("replay", "run", "t-0")
+    assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
