@@ -18,6 +18,7 @@ from functools import cache
 from pathlib import Path
 from typing import Final
 
+import scenarios.behaviors
 from bridge import keys
 from bridge.director import Outside, RemoteDirector, Waiting, serve_director
 from bridge.session import Session
@@ -59,24 +60,36 @@ def serve(session: Session) -> None:
 @cache
 def behaviours() -> str:
     """What the behaviours are: a hash of their source and of all of ours that it imports. 16 hexadecimal digits."""
-    found: dict[str, bytes] = {}
-    _gather(react.__module__, found)
     digest = hashlib.sha256()
-    for name in sorted(found):
-        digest.update(name.encode() + b"\0" + found[name] + b"\0")
+    for name, source in sorted(sources(scenarios.behaviors.__name__).items()):
+        digest.update(name.encode() + b"\0" + source + b"\0")
     return digest.hexdigest()[:16]
+
+
+def sources(name: str) -> dict[str, bytes]:
+    """The source of a module and of all of ours that it imports, however indirectly, by their names."""
+    found: dict[str, bytes] = {}
+    _gather(name, found)
+    return found
 
 
 def _gather(name: str, found: dict[str, bytes]) -> None:
     """Put the source of a module, and of what it imports of ours, into `found`."""
-    spec = importlib.util.find_spec(name)
-    if name in found or spec is None or spec.origin is None:
+    if name in found:
+        return
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:  # what is imported from a module that is no package
+        return
+    if spec is None or spec.origin is None:
         return
     found[name] = Path(spec.origin).read_bytes()
     for node in ast.walk(ast.parse(found[name])):
-        imported = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+        imported: list[str] = []
         if isinstance(node, ast.Import):
             imported = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         for other in imported:
             if other.startswith(_OURS):
                 _gather(other, found)

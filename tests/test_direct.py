@@ -220,3 +220,14 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path) -> 
             process.wait()
     bad = subprocess.run([*WORDS, "direct", "--listen", "7448"], env=ENVIRONMENT, capture_output=True, text=True)
     assert bad.returncode == 2 and "--listen '7448': write it as PROTOCOL/ADDRESS" in bad.stderr
+
+
+def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
+    """The modules whose source is hashed hold all that a fresh process has loaded with them."""
+    from scenarios.directing import behaviours, sources
+
+    code = "import sys, scenarios.behaviors; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
+    assert {"scenarios.behaviors.frontal", "cosim.events"} < ours <= set(sources("scenarios.behaviors"))
+    assert len(behaviours()) == 16 and behaviours() == behaviours()
