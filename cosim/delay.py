@@ -1,13 +1,15 @@
 """Delay: what the robot costs the people and vehicles around it, against the same street without it.
 
-Both streets begin alike. As far as somebody is in both (the same id, entered at the same tick and place), the ways
-covered in the shared time are compared: delay = (way without - way with the robot) / pace without it, in seconds; it
-is negative for who got on faster. Somebody who never moves without the robot has no pace and is left out. A small cause
-spreads: far from the robot the two streets differ by chance, so the sum over those that came near it is told apart.
+Both streets begin alike. As far as somebody is in both (the same id, entered at the same tick and place), it is asked at
+the end of the shared time how long ago it would have been, without the robot, where it is now; negative for who got on
+faster. Who steps aside and back has not got on. Within SLACK_M is the same place, so that delays are told rather too
+small. Somebody who never moves without the robot is left out. A small cause spreads: far from the robot the two streets
+differ by chance, so the sum over those that came near it is told apart.
 """
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections.abc import Sequence
 from typing import Final, NamedTuple
@@ -20,6 +22,7 @@ from cosim.state import People, Vehicles
 NEAR_M: Final = 10.0
 MOVING_MPS: Final = 0.1
 SAME_PLACE_M: Final = 0.5
+SLACK_M: Final = 0.5
 
 
 class Delay(NamedTuple):
@@ -76,16 +79,31 @@ def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Trac
             unmatched += 1
             continue
         shared = min(len(mine), len(other))
-        steps_mine, steps_other = _steps(mine[:shared]), _steps(other[:shared])
-        moving = steps_other > MOVING_MPS * tick_s
-        if not moving.any():
+        mine, other = mine[:shared], other[:shared]
+        if _steps(other).max(initial=0.0) <= MOVING_MPS * tick_s:
             continue
-        late_s = float((steps_other.sum() - steps_mine.sum()) / steps_other[moving].mean()) * tick_s
-        gap = mine[:shared] - at[first : first + shared]
+        late_s = _late(mine, other) * tick_s
+        gap = mine - at[first : first + shared]
         is_near = bool((np.hypot(gap[:, 0], gap[:, 1]) < NEAR_M).any())
         delay_s, compared = delay_s + late_s, compared + 1
         near_s, near = near_s + late_s * is_near, near + is_near
     return Delay(delay_s, near_s, compared, near, unmatched)
+
+
+def _late(mine: Floats, other: Floats) -> int:
+    """By how many ticks the end of one way (N, 2) comes later than on the other, which goes the same way."""
+    behind, off_m = _since(mine[-1], other)
+    ahead, off_other_m = _since(other[-1], mine)
+    return behind if off_m <= off_other_m else -ahead
+
+
+def _since(point: Floats, way: Floats) -> tuple[int, float]:
+    """How many ticks before the end of a way (N, 2) it was last at a point (2,), and how near it came to it."""
+    away = np.hypot(*(way - point).T)
+    nearest = float(away.min())
+    # A circle that cuts SLACK_M off a straight way which passes the point at a distance.
+    last = np.flatnonzero(away <= math.hypot(nearest, SLACK_M))[-1]
+    return len(way) - 1 - int(last), nearest
 
 
 def _steps(way: Floats) -> Floats:

@@ -26,12 +26,21 @@ HELD_UP = [0.05 * min(k, 100) for k in range(201)]
 """5 s at 1 m/s, then 5 s of standing."""
 
 
-def test_who_stands_for_five_seconds_is_five_seconds_late() -> None:
-    """One of two people, near the robot, is held up; the other, far from it, is not; event pedestrians do not count."""
+def test_who_stands_for_five_seconds_is_late_by_them() -> None:
+    """One of two people, near the robot, is held up for 5 s, less the time for half a metre; the other, far from it, is
+    not; event pedestrians do not count."""
     robot = [(5.0, 1.0)] * 201
     found = delay_of(robot, tracks(HELD_UP, WALK), tracks(WALK, WALK), 0.05)
-    assert found.delay_s == pytest.approx(5.0) and found.near_s == pytest.approx(5.0)
+    assert found.delay_s == pytest.approx(4.5) and found.near_s == pytest.approx(4.5)
     assert (found.compared, found.near, found.unmatched) == (2, 1, 0)
+    faster = delay_of(robot, tracks(WALK, WALK), tracks(HELD_UP, WALK), 0.05)
+    assert faster.delay_s == pytest.approx(-4.5)
+
+
+def test_who_steps_aside_and_back_has_not_got_on() -> None:
+    """Somebody who waits for the last five seconds is not faster for shuffling about meanwhile."""
+    shuffling = [x + (0.3 * (k % 2) if k > 100 else 0.0) for k, x in enumerate(HELD_UP)]
+    assert delay_of([(5.0, 1.0)] * 201, tracks(shuffling), tracks(HELD_UP), 0.05).delay_s == pytest.approx(0.0)
 
 
 def test_somebody_else_of_the_same_name_is_not_compared() -> None:
