@@ -1,10 +1,10 @@
 """Delay: what the robot costs the people and vehicles around it, against the same street without it.
 
-Both streets begin alike. As far as somebody is in both (the same id, entered at the same tick and place), it is asked at
-the end of the shared time how long ago it would have been, without the robot, where it is now; negative for who got on
-faster. Who steps aside and back has not got on. Within SLACK_M is the same place, so that delays are told rather too
-small. Somebody who never moves without the robot is left out. A small cause spreads: far from the robot the two streets
-differ by chance, so the sum over those that came near it is told apart.
+Both streets begin alike. As far as somebody is in both (the same id, entered at the same tick and place), it is asked
+at the end of the shared time how long ago it would have been, without the robot, where it is now; negative for who got
+on faster. Who steps aside and back has not got on. Within SLACK_M is the same place, so that delays are told rather
+too small. Somebody who never moves without the robot is left out. A small cause spreads: far from the robot the two
+streets differ by chance, so the sum over those that came near it is told apart.
 """
 
 from __future__ import annotations

@@ -7,13 +7,21 @@ import re
 import subprocess
 import sys
 
+import msgspec
 import pytest
 
 from cosim.errors import MapError
-from cosim.scenario import City
+from cosim.policies.route import bearing_to
+from cosim.ports import Manifest, Observation
+from cosim.referee import Verdict
+from cosim.roadway import braking_for
+from cosim.scenario import City, CrowdSpec
+from cosim.state import Command
+from cosim.step import Step
 from cosim.walks import WalkGraph
 from scenarios.assemble import place
 from scenarios.crossings import AFTER_M, BEFORE_M, build_all
+from scenarios.run import episode
 
 pytestmark = pytest.mark.engine
 
@@ -58,3 +66,37 @@ def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red() -> None:
     rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", done.stdout)}
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
     assert int(re.findall(r"(\d+) vehicles passed stop lines", done.stdout)[0]) > 0
+
+
+class Heedless:
+    """Follows its route at walking pace, whatever the signals and the traffic do."""
+
+    manifest = Manifest("heedless", rate_hz=10.0, camera=None, privileged=True)
+
+    def reset(self, scenario_id: str, seed: int) -> None: ...
+
+    def act(self, observation: Observation) -> Command:
+        assert observation.privileged is not None
+        bearing_rad = bearing_to(observation.privileged, 0.0)
+        return Command(0.5 * max(1.0 - abs(bearing_rad), 0.1), max(-0.65, min(0.65, 2.4 * bearing_rad)))
+
+
+def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
+    """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none touches it."""
+    _, street_map = place(SMALL)
+    drawn = build_all(SMALL, street_map, WalkGraph(street_map), 0, 1)[0]
+    busy = msgspec.structs.replace(drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=60.0)
+    slowest: dict[str, float] = {}
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        braking = braking_for(step.motion.robot.pose, step.street, step.street_after, 0.05)
+        vehicles = step.street_after.vehicles
+        for name, speed_mps in zip(vehicles.ids, vehicles.speed.tolist(), strict=True):
+            if name in braking or name in slowest:
+                slowest[name] = min(slowest.get(name, 99.0), speed_mps)
+
+    measures = episode(busy, Heedless(), watch=watch).record.measures
+    assert measures["red_light_entries"] == 1
+    assert measures["vehicles_braked"] == 1 and min(slowest.values()) < 0.1
+    assert measures["collisions_vehicle"] == 0
+    assert measures["carriageway_time_s"] is not None and measures["carriageway_time_s"] > 10.0
