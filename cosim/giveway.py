@@ -1,12 +1,14 @@
 """Nobody walks into the robot: how a person steps round it.
 
-SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; event
-pedestrians know no obstacles at all. A person goes where it wants to go, but slides round the robot's outline instead
-of entering it. Only the person's own motion is changed: a robot that drives at somebody still hits them.
+SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; our own
+people see other people (`cosim.steering`), the robot they see here. A person goes where it wants to go, but slides
+round the robot's outline instead of entering it. Only the person's own motion is changed: a robot that drives at
+somebody still hits them.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -29,6 +31,11 @@ class Body(NamedTuple):
     pose: Pose
     half_m: tuple[float, float]
     v_mps: float = 0.0
+
+
+def within_reach_m(body: Body) -> float:
+    """How near to the robot's middle somebody must be for a step to be led round it."""
+    return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + KEEP_M
 
 
 def stepped_round(before: Floats, wanted: Floats, body: Body) -> Floats:

@@ -9,8 +9,7 @@ share the avoidance between those who see each other, and slow down who finds no
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -30,9 +29,8 @@ LEAST_M: Final = 0.45
 PARTED_S: Final = 0.5
 """In this time those who are too near are parted."""
 
-TURN_RAD: Final = math.radians(10.0)
-TURNS: Final = 11
-"""Headings that are tried: so many steps to either side, beyond a right angle."""
+TURNS: Final = tuple((math.cos(math.radians(turn)), math.sin(math.radians(turn))) for turn in range(10, 120, 10))
+"""Cosine and sine of the turns that are tried to either side: in steps of 10 degrees, beyond a right angle."""
 
 GIVES: Final = 0.98
 """Those who stand nearer than two radii come no nearer than this share of their distance."""
@@ -65,6 +63,8 @@ class _Disk(NamedTuple):
     moving_mps: Vector
     keep_m: float
     share: float
+    room_m2: float
+    """The square of the distance minus that of the distance to keep."""
 
 
 def steered(
@@ -88,11 +88,10 @@ def steered(
     disks = _seen(at_m, wanted_mps, neighbours)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
-    meets_s = partial(_meets_in_s, horizon_s=horizon_s)
-    if math.dist(moving_mps, wanted_mps) < EPS and meets_s(wanted_mps, disks, walls) >= horizon_s:
+    if math.dist(moving_mps, wanted_mps) < EPS and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s:
         return wanted_mps
     minded = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
-    heading_mps = _most_open(wanted_mps, moving_mps, lambda v: meets_s(v, minded, walls), horizon_s)
+    heading_mps = _most_open(wanted_mps, moving_mps, minded, walls, horizon_s)
     planes = [half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S) for d in disks]
     planes += walls
     if all(_permits(plane, *heading_mps) for plane in planes):
@@ -110,7 +109,8 @@ def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour]) -> 
         ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
         if far_m < NEAR_M and (ahead or far_m < LEAST_M):
             keep_m = min(2 * PERSON_RADIUS_M, max(GIVES * far_m, LEAST_M))
-            disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share))
+            room_m2 = dx * dx + dy * dy - keep_m * keep_m
+            disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks
 
 
@@ -121,40 +121,58 @@ def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
-def _most_open(wanted_mps: Vector, moving_mps: Vector, meets_s: Callable[[Vector], float], horizon_s: float) -> Vector:
+def _most_open(
+    wanted_mps: Vector, moving_mps: Vector, disks: Sequence[_Disk], walls: Sequence[HalfPlane], horizon_s: float
+) -> Vector:
     """The wanted velocity, turned no more than needed to meet nobody within the horizon; else to meet the latest.
 
     Of two that are turned alike, that on the side to which one moves already; to the right for who moves straight.
     """
     x, y = wanted_mps
-    best, latest_s = wanted_mps, meets_s(wanted_mps)
+    best, latest_s = wanted_mps, _meets_in_s(x, y, disks, walls, horizon_s)
+    if latest_s >= horizon_s:
+        return best
     side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > EPS else -1.0
-    for k in range(2, 2 * TURNS + 2):
-        if latest_s >= horizon_s:
-            break
-        turn_rad = (side if k % 2 == 0 else -side) * (k // 2) * TURN_RAD
-        cos, sin = math.cos(turn_rad), math.sin(turn_rad)
-        turned = (cos * x - sin * y, sin * x + cos * y)
-        in_s = meets_s(turned)
-        if in_s > latest_s:
-            best, latest_s = turned, in_s
+    for cos, sin in TURNS:
+        for aside in (side * sin, -side * sin):
+            turned = (cos * x - aside * y, aside * x + cos * y)
+            in_s = _meets_in_s(*turned, disks, walls, horizon_s, latest_s)
+            if in_s >= horizon_s:
+                return turned
+            if in_s > latest_s:
+                best, latest_s = turned, in_s
     return best
 
 
-def _meets_in_s(velocity_mps: Vector, disks: Sequence[_Disk], walls: Sequence[HalfPlane], *, horizon_s: float) -> float:
-    """When who goes on so comes too near to somebody, at most `horizon_s`; 0 where a wall is in the way."""
-    if not all(_permits(wall, *velocity_mps) for wall in walls):
-        return 0.0
+def _meets_in_s(
+    x_mps: float,
+    y_mps: float,
+    disks: Sequence[_Disk],
+    walls: Sequence[HalfPlane],
+    horizon_s: float,
+    enough_s: float = -1.0,
+) -> float:
+    """When who goes on so comes too near to somebody, at most `horizon_s`; 0 where a wall is in the way.
+
+    enough_s: once it is known to be no later than this, how much earlier does not matter.
+    """
+    for wall in walls:
+        if not _permits(wall, x_mps, y_mps):
+            return 0.0
     soonest_s = horizon_s
-    for (dx, dy), (vx, vy), keep_m, _ in disks:
-        rx, ry = velocity_mps[0] - vx, velocity_mps[1] - vy
+    for (dx, dy), (vx, vy), _, _, room_m2 in disks:
+        rx, ry = x_mps - vx, y_mps - vy
         closing = dx * rx + dy * ry
         if closing <= 0.0:
             continue
         pace = rx * rx + ry * ry
-        within = closing * closing - pace * (dx * dx + dy * dy - keep_m * keep_m)
+        within = closing * closing - pace * room_m2
         if within > 0.0:
-            soonest_s = min(soonest_s, max((closing - math.sqrt(within)) / pace, 0.0))
+            in_s = (closing - math.sqrt(within)) / pace
+            if in_s < soonest_s:
+                soonest_s = max(in_s, 0.0)
+                if soonest_s <= enough_s:
+                    break
     return soonest_s
 
 

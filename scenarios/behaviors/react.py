@@ -82,15 +82,12 @@ def _advance(event: Event, state: EventState, query: EventQuery) -> EventState:
 
 def _timed(before: EventState, after: EventState, query: EventQuery) -> EventState:
     """The state with the velocities of this tick's steps in it."""
-    walkers = tuple(
-        msgspec.structs.replace(
-            new,
-            vx_mps=(new.x_m - old.x_m) * 1000 / query.tick_ms,
-            vy_mps=(new.y_m - old.y_m) * 1000 / query.tick_ms,
-        )
-        for old, new in zip(before.walkers, after.walkers, strict=True)
-    )
-    return msgspec.structs.replace(after, walkers=walkers)
+    walkers = []
+    for old, new in zip(before.walkers, after.walkers, strict=True):
+        vx, vy = (new.x_m - old.x_m) * 1000 / query.tick_ms, (new.y_m - old.y_m) * 1000 / query.tick_ms
+        same = (vx, vy) == (new.vx_mps, new.vy_mps)
+        walkers.append(new if same else msgspec.structs.replace(new, vx_mps=vx, vy_mps=vy))
+    return msgspec.structs.replace(after, walkers=tuple(walkers))
 
 
 def _shown(event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:

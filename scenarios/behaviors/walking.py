@@ -9,7 +9,7 @@ import numpy as np
 
 from cosim.events import Event, EventQuery, Walker
 from cosim.geometry import Pose, wrap_angle
-from cosim.giveway import Body, stepped_round, touches
+from cosim.giveway import Body, stepped_round, touches, within_reach_m
 from cosim.state import PERSON_RADIUS_M
 from cosim.steering import Vector
 from scenarios.behaviors.sight import Sight, led_round, taken
@@ -88,8 +88,10 @@ def stepped(
     led = led_round(walker, wanted, sight, goal, insisting=insisting)
     if led != wanted:
         heading_rad = facing(walker, led, sight)
-    before, after = np.array([[walker.x_m, walker.y_m]]), np.array([led])
-    x_m, y_m = stepped_round(before, after, robot_of(sight.query))[0].tolist()
+    x_m, y_m = led
+    robot = robot_of(sight.query)
+    if math.dist(led, robot.pose[:2]) < within_reach_m(robot):
+        x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([led]), robot)[0].tolist()
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
 
 
