@@ -91,6 +91,11 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int, mapped: MappedThin
     return [laid for laid in found if len(laid.mesh)]
 
 
+def paved(strip: Strip) -> bool:
+    """Whether what lies before the houses of a sidewalk's street is paved; else there are gardens."""
+    return street_style(strip.street_class) in _COVERS
+
+
 def _of(strip: Strip, seed: int, houses: shapely.Geometry) -> list[tuple[Cover, shapely.Geometry]]:
     """The frontage of a sidewalk and its driveways. houses: the ground near houses of the map."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])

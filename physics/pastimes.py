@@ -16,6 +16,7 @@ from cosim.geometry import wrap_angle
 from cosim.state import PERSON_RADIUS_M
 from cosim.streetmap import Lane, StreetMap
 from physics.buildings import Building
+from physics.frontage import paved
 from physics.fronts import shop_windows
 from physics.furniture import Prop
 
@@ -51,6 +52,9 @@ def spots(street_map: StreetMap, props: Sequence[Prop], buildings: Sequence[Buil
         elif prop.kind == "shelter":
             yield from _by_shelter(prop, street_map)
     for building in buildings:
+        strip = street_map.strips.get(building.id.removeprefix("building:").rpartition(":")[0])
+        if strip is not None and not paved(strip):
+            continue  # nobody tramples a garden
         for number, window in enumerate(shop_windows(building, street_map)):
             for away_m in _WINDOW_M:
                 x = window.x_m - away_m * math.cos(window.heading_rad)
