@@ -25,7 +25,7 @@ from rich.table import Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
-from cosim.cli_crowd import compare_one
+from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
@@ -92,6 +92,9 @@ def run(
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
     residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
+    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
+    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
     live: Annotated[
@@ -117,7 +120,7 @@ def run(
     from cosim.runfolder import RunFolder, RunSpec
     from cosim.versions import versions
     from physics.cameras import renderer_of
-    from scenarios.catalog import chosen, with_residents
+    from scenarios.catalog import chosen, with_crowd
     from scenarios.catalog import suite as shipped
     from scenarios.pool import run_all
 
@@ -129,8 +132,7 @@ def run(
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
         whole = shipped(suite)
-    if residents is not None:
-        whole = with_residents(whole, residents)
+    whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
     picked = chosen(whole, scenario or (), episodes, event or ())
     manifest = load_policy(policy).manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"

@@ -8,7 +8,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from cosim.cli_crowd import bench_crossings, bench_crowd
+from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
 
 out = Console()
 err = Console(stderr=True)
@@ -31,10 +31,13 @@ def bench(
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
     jobs: Annotated[int, typer.Option(min=1, help="For `crossings`: environment processes.")] = 1,
+    groups: Annotated[float, typer.Option(help=f"For `crowd`: {GROUPS_HELP}")] = 0.0,
+    elderly: Annotated[float, typer.Option(help=f"For `crowd`: {ELDERLY_HELP}")] = 0.0,
+    children: Annotated[float, typer.Option(help=f"For `crowd`: {CHILDREN_HELP}")] = 0.0,
 ) -> None:
     """Measure one environment process, part by part, the cameras, or what robot, people and vehicles do in traffic."""
     if what == "crowd":
-        bench_crowd(3 if cities is None else cities, minutes, residents)
+        bench_crowd(3 if cities is None else cities, minutes, residents, groups, elderly, children)
         return
     if what == "crossings":
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)

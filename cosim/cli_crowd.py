@@ -21,6 +21,10 @@ LIGHTS = (
     ("vehicles passed at yellow", "vehicles passed stop lines", ""),
     ("vehicles passed at green", "vehicles passed stop lines", ""),
 )
+GROUPS_HELP = "Share of the walkers, 0 to 1, who walk in groups of two and three."
+ELDERLY_HELP = "Share of the walkers who are elderly: they walk slower."
+CHILDREN_HELP = "Share of the walkers who are children, each in a group with an adult: at most half of --groups."
+
 SHARES = (
     ("overlaps", "pairs in contact range", "< 0.1 %"),
     ("pairs nearer than 0.45 m", "pairs in contact range", ""),
@@ -35,14 +39,15 @@ SHARES = (
 """What is counted, of what, and the target."""
 
 
-def bench_crowd(cities: int, minutes: float, residents: int = 0) -> None:
+def bench_crowd(cities: int, minutes: float, residents: int, groups: float, elderly: float, children: float) -> None:
     """Watch the crowd of several cities and print how people keep apart, out of things and to the lights."""
     from cosim.scenario import CrowdSpec
     from scenarios.bench_crowd import summed, watch_all
+    from scenarios.group_tally import APART_M
 
+    spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
     with err.status("watching ...") as status:
-        crowd = CrowdSpec(residents=residents)
-        found = watch_all(cities, minutes, crowd, lambda words: status.update(f"watching: {words}"))
+        found = watch_all(cities, minutes, spec, lambda words: status.update(f"watching: {words}"))
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
     places = f"{len(found)} cities, {total_min:.0f} min, {sum(f.crossings for f in found)} signalised crossings entered"
@@ -60,6 +65,13 @@ def bench_crowd(cities: int, minutes: float, residents: int = 0) -> None:
             one.place, f"{one.minutes:.0f}", f"{one.persons:.0f}", f"{100 * overlaps:.4f} %", f"{one.crowd_ms:.2f}"
         )
     out.print(each)
+    if gaps_m := sorted(gap for one in found for gap in one.group_gaps_m):
+        middle, most = (gaps_m[int(share * len(gaps_m))] for share in (0.5, 0.95))
+        apart = sum(gap > APART_M for gap in gaps_m) / len(gaps_m)
+        out.print(
+            f"Groups, the loneliest member's distance to its nearest fellow: median {middle:.2f} m, 95 % within "
+            f"{most:.2f} m, beyond {APART_M:g} m {100 * apart:.2f} % of the time."
+        )
 
 
 def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None:

@@ -10,6 +10,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
 from cosim.errors import UsageError, unknown
 
 if TYPE_CHECKING:
@@ -43,18 +44,21 @@ def look(
     ] = "long-horizon",
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
     residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
+    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
+    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
     camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import chosen, with_residents
+    from scenarios.catalog import chosen, with_crowd
     from scenarios.catalog import suite as shipped
     from scenarios.look import look
 
     picked = view_of(view)
     pixels = size_of(size)
-    whole = shipped(suite)
-    (one,) = chosen(whole if residents is None else with_residents(whole, residents), [scenario])
+    whole = with_crowd(shipped(suite), residents=residents, groups=groups, elderly=elderly, children=children)
+    (one,) = chosen(whole, [scenario])
     with err.status(f"driving to {at:g} s ..." if at else "setting up ..."):
         image, time_s = look(one, policy, at, picked, pixels, camera_here(camera))
     save(image, output)

@@ -104,6 +104,8 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
     density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
     residents: people besides who know the street, sit on its benches, look into its shop windows, wait at its stops
     (`scenarios.residents`); so many are kept within 60 m of the robot.
+    Shares of the persons: groups, of those who walk in groups of two and three; elderly and children, of those who walk
+    slower than others. A child walks in a group with an adult, at the child's pace.
     """
 
     persons: int = DEFAULT_PERSONS
@@ -111,8 +113,12 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
     vehicles: int = 20
     density: float | msgspec.UnsetType = msgspec.UNSET
     residents: int = 0
+    groups: float = 0.0
+    elderly: float = 0.0
+    children: float = 0.0
 
     def __post_init__(self) -> None:
+        self._check_shares()
         if not 0 <= self.residents <= MOST_RESIDENTS:
             raise SpecError(f"crowd residents must be in [0, {MOST_RESIDENTS}], not {self.residents}")
         if self.persons < 0 or self.vehicles < 0:
@@ -125,6 +131,21 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"crowd density must be in [0, {MOST_PER_1000_M2:g}] per 1000 m2, not {self.density}")
         if self.persons != DEFAULT_PERSONS:
             raise SpecError(f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both")
+
+    def _check_shares(self) -> None:
+        for field in ("groups", "elderly", "children"):
+            if not 0.0 <= getattr(self, field) <= 1.0:
+                raise SpecError(f"crowd {field} must be a share in [0, 1], not {getattr(self, field)}")
+        if 2.0 * self.children > self.groups + 1e-9:
+            raise SpecError(
+                f"crowd children must be in [0, groups / 2] = [0, {self.groups / 2:g}], not {self.children}: "
+                f"each walks in a group with an adult; give groups of {2.0 * self.children:g} or more"
+            )
+        if self.elderly + 2.0 * self.children > 1.0 + 1e-9:
+            raise SpecError(
+                f"crowd elderly must be in [0, 1 - 2 children] = [0, {1.0 - 2.0 * self.children:g}], "
+                f"not {self.elderly}: children walk with adults who are not elderly"
+            )
 
 
 class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
@@ -227,8 +248,11 @@ def content_hash(spec: msgspec.Struct) -> str:
 
 
 ADDED: Mapping[str, object] = MappingProxyType(
-    {"light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0, "residents": 0}
-)
+    {
+        "light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0, "residents": 0,
+        "groups": 0.0, "elderly": 0.0, "children": 0.0,
+    }
+)  # fmt: skip
 """Fields that came later, with the values that mean what was meant before there were such fields."""
 
 

@@ -36,6 +36,7 @@ from scenarios.assemble import clear_of, place
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
 from scenarios.crowd_tally import Tally
+from scenarios.group_tally import widest_gaps
 from scenarios.long_horizon import build
 from scenarios.residents.director import among_residents
 from sumo_nets.crowd import SumoCrowd
@@ -45,12 +46,14 @@ THINGS_M = 60.0
 """Buildings and props are looked at this far around the route."""
 
 CITY_M = 2000.0
+GROUPS_EVERY_TICKS = 10
 
 
 class Watched(msgspec.Struct, frozen=True, kw_only=True):
     """What was seen in one city. counts: see `Tally`. crossings: signalised ones that somebody entered.
 
-    crowd_ms: wall milliseconds of a step of the crowd, on the mean.
+    crowd_ms: wall milliseconds of a step of the crowd, on the mean. group_gaps_m: every half second, of each group, how
+    far its loneliest member is from its nearest fellow.
     """
 
     place: str
@@ -59,6 +62,7 @@ class Watched(msgspec.Struct, frozen=True, kw_only=True):
     counts: dict[str, float]
     crossings: int
     crowd_ms: float
+    group_gaps_m: tuple[float, ...] = ()
 
 
 class Glider:
@@ -98,12 +102,13 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
     graph, clock = WalkGraph(street_map), Clock.for_rate(Route.manifest.rate_hz)
     counts: list[Mapping[str, float]] = []
     crossings: set[str] = set()
+    gaps_m: list[float] = []
     ticks, persons, crowd_s, seed = 0, 0, 0.0, 0
     wanted = clock.ticks(60.0 * minutes)
     while ticks < wanted:
         scenario = msgspec.structs.replace(build(city, street_map, graph, seed, f"crowd-{seed}"), crowd=crowd)
         seed += 1
-        tally, done, shown, spent_s = drive(scenario, street_map, wanted - ticks)
+        tally, done, shown, spent_s = drive(scenario, street_map, wanted - ticks, gaps_m)
         counts.append(tally.counts)
         crossings |= tally.crossings
         ticks, persons, crowd_s = ticks + done, persons + shown, crowd_s + spent_s
@@ -114,11 +119,17 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
         counts=summed(counts),
         crossings=len(crossings),
         crowd_ms=1000.0 * crowd_s / ticks,
+        group_gaps_m=tuple(gaps_m),
     )
 
 
-def drive(scenario: Scenario, street_map: StreetMap, limit_ticks: int) -> tuple[Tally, int, int, float]:
-    """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's wall seconds."""
+def drive(
+    scenario: Scenario, street_map: StreetMap, limit_ticks: int, gaps_m: list[float]
+) -> tuple[Tally, int, int, float]:
+    """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's wall seconds.
+
+    gaps_m: takes up the gaps within groups.
+    """
     net_path, _ = place(scenario.place)
     around = shapely.buffer(LineString(scenario.route), THINGS_M)
     walkable = street_map.walkable_near(around)
@@ -154,6 +165,8 @@ def drive(scenario: Scenario, street_map: StreetMap, limit_ticks: int) -> tuple[
             persons += sum(name.startswith("c") for name in street.people.ids)
             tally.see(street)
             tally.drove(lines.passed(street.vehicles.ids))
+            if ticks % GROUPS_EVERY_TICKS == 0:
+                gaps_m += widest_gaps(crowd.groups, street.people)
             verdict = referee.judge(step)
             if verdict.ended is not None or ticks >= limit_ticks:
                 break

@@ -28,14 +28,18 @@ def suite(name: str) -> Suite:
     return read_suite(SUITES[name])
 
 
-def with_residents(whole: Suite, count: int) -> Suite:
-    """The suite with so many residents in each scenario: another suite, whose version says so.
+def with_crowd(whole: Suite, **asked: float | None) -> Suite:
+    """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version says so.
 
-    Raises SpecError when there are too many.
+    What is None stays as it is. Raises SpecError where a crowd cannot be so.
     """
+    changes = {field: value for field, value in asked.items() if value is not None}
+    if not changes:
+        return whole
     replace = msgspec.structs.replace
-    scenarios = tuple(replace(s, crowd=replace(s.crowd, residents=count)) for s in whole.scenarios)
-    return replace(whole, scenarios=scenarios, version=f"{whole.version}-residents{count}")
+    scenarios = tuple(replace(s, crowd=replace(s.crowd, **changes)) for s in whole.scenarios)
+    version = "-".join([whole.version, *(f"{field}{value:g}" for field, value in changes.items())])
+    return replace(whole, scenarios=scenarios, version=version)
 
 
 def chosen(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,7 @@ class StreetAgain(SumoCrowd):
     def _demand(
         self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
     ) -> tuple[Pedestrians, Drivers]:
-        people = PedestriansAgain(libsumo, self._map, self._spec, rng_persons, self._closed)
+        people = PedestriansAgain(libsumo, self._map, self._spec, rng_persons, self._closed, self._together)
         drivers = DriversAgain(libsumo, self._map, self._spec, rng_vehicles)
         people.before = drivers.before = self._before
         drivers.sizes = {
@@ -39,15 +40,24 @@ class StreetAgain(SumoCrowd):
 
 
 class PedestriansAgain(Pedestrians):
-    """People who enter and leave as they did before."""
+    """People who enter and leave as they did before; who set out at one moment on one walk at one speed are a group."""
 
     before: Entrances
 
     def fill(self, x_m: float, y_m: float) -> None:
-        again(libsumo, self.before, PEDESTRIANS)
+        self._again()
 
     def roll(self, x_m: float, y_m: float, seen: Any, at_red: Any) -> None:
+        self._together.forget(libsumo.person.getIDList())
+        self._together.keep(seen)
+        self._again()
+
+    def _again(self) -> None:
         again(libsumo, self.before, PEDESTRIANS)
+        calls = self.before.at(PEDESTRIANS, libsumo.simulation.getTime())
+        walks = (call for call in calls if call.name == "appendWalkingStage")
+        for (walk, mps), company in groupby(walks, key=lambda call: (call.arguments[1], call.options["speed"])):
+            self._together.join([call.arguments[0] for call in company], mps, walk)
 
 
 class DriversAgain(Drivers):

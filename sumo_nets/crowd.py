@@ -34,6 +34,7 @@ from sumo_nets.kerbs import Kerbs
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
 from sumo_nets.smooth import PoseFilter
+from sumo_nets.together import Together
 
 TICK_MS = 50
 """One step of SUMO."""
@@ -121,6 +122,11 @@ class SumoCrowd(Crowd):
             raise EngineError("this SumoCrowd is not running: use it as a context manager")
         return self._street
 
+    @property
+    def groups(self) -> tuple[tuple[str, ...], ...]:
+        """The ids of those who walk together, group by group."""
+        return self._together.groups
+
     def step(self, robot: RobotState, reply: EventReply, *, absent: bool = False) -> Street:
         """One tick on, with the robot and the event pedestrians where they are now.
 
@@ -165,6 +171,7 @@ class SumoCrowd(Crowd):
         self._walks = Walks(libsumo, self._map)
         self._signals = Signals(libsumo, self._map)
         self._kerbs = Kerbs(self._map)
+        self._together = Together(libsumo, self._map.strips, TICK_MS / 1000)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
         self._serial: Iterator[int] = count()
         self._robot = Proxy(libsumo, self._walks, base="r", kind="robot", serial=self._serial)
@@ -186,7 +193,7 @@ class SumoCrowd(Crowd):
         """Those who let people and vehicles in and out; what they do is kept in `entrances`."""
         self.entrances = Entrances()
         on_foot, driving = (Kept(libsumo, self.entrances, whose) for whose in (PEDESTRIANS, DRIVERS))
-        people = Pedestrians(on_foot, self._map, self._spec, rng_persons, self._closed)
+        people = Pedestrians(on_foot, self._map, self._spec, rng_persons, self._closed, self._together)
         return people, Drivers(driving, self._map, self._spec, rng_vehicles)
 
     def _watch(self, x_m: float, y_m: float) -> None:

@@ -7,19 +7,22 @@ kind draws from its own generator; ids are "c<n>" and "v<n>".
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import msgspec
 import numpy as np
-from scipy.spatial import cKDTree
 
-from cosim.geometry import Floats, Polyline, Pose, heading_to_sumo
+from cosim.gait import age_of
+from cosim.geometry import Floats, heading_to_sumo
 from cosim.scenario import CrowdSpec
 from cosim.streetmap import Port, StreetMap
 from cosim.walks import WalkGraph
+from sumo_nets.company import STRIPE_M, Companies
 from sumo_nets.proxy import END_M, KEEP_ROUTE, MATCH_M
 from sumo_nets.room import Room
+from sumo_nets.spots import Spot, Spots
+from sumo_nets.together import Together
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
@@ -37,7 +40,6 @@ STUCK_S = 60.0
 """A person that has waited this long, but not at a red light, is taken out."""
 
 EDGE_M = 0.4
-PERSON_MPS = (1.1, 1.65)
 PERSONAL_SPACE_M = 1.5
 WALK_EDGES = 30
 BARRIER_MARGIN_M = 1.0
@@ -67,56 +69,20 @@ class Seen(NamedTuple):
     waiting_s: float
 
 
-class Spot(NamedTuple):
-    """A place on the middle line of an edge, heading along it; share: of the edge's length that lies before it."""
-
-    edge: str
-    share: float
-    pose: Pose
-
-
-def shifted(pose: Pose, left_m: float) -> tuple[float, float]:
-    """The point `left_m` to the left of a pose."""
-    return pose.x_m - left_m * math.sin(pose.heading_rad), pose.y_m + left_m * math.cos(pose.heading_rad)
-
-
-class Spots:
-    """Where somebody may enter: points every `step_m` along lines, found by their distance."""
-
-    def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
-        """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in metres."""
-        self._edges: list[str] = []
-        shares: list[Floats] = [np.zeros(0)]
-        poses: list[Floats] = [np.zeros((0, 3))]
-        for edge, xy, start_m, end_m in lines:
-            line = Polyline(xy)
-            s = np.arange(start_m, line.length_m - end_m, step_m)
-            x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
-            self._edges += [edge] * len(s)
-            shares.append(s / line.length_m)
-            poses.append(np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])]))
-        self._shares = np.concatenate(shares)
-        self._poses = np.concatenate(poses)
-        self._tree = cKDTree(self._poses[:, :2])
-
-    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[int]:
-        """The numbers of the spots at a distance in [low_m, high_m)."""
-        hits = np.array(self._tree.query_ball_point((x_m, y_m), high_m, return_sorted=True), dtype=np.intp)
-        gap = self._poses[hits, :2] - (x_m, y_m)
-        near: list[int] = hits[np.hypot(gap[:, 0], gap[:, 1]) >= low_m].tolist()
-        return near
-
-    def __getitem__(self, number: int) -> Spot:
-        return Spot(self._edges[number], float(self._shares[number]), Pose(*self._poses[number].tolist()))
-
-
 class Pedestrians:
     """The background persons."""
 
     def __init__(
-        self, engine: Any, street_map: StreetMap, spec: CrowdSpec, rng: np.random.Generator, closed: frozenset[Port]
+        self,
+        engine: Any,
+        street_map: StreetMap,
+        spec: CrowdSpec,
+        rng: np.random.Generator,
+        closed: frozenset[Port],
+        together: Together,
     ) -> None:
         self._engine, self._spec, self._rng, self._closed = engine, spec, rng, closed
+        self._together = together
         self._graph = WalkGraph(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
         self._spots = Spots(
@@ -129,6 +95,7 @@ class Pedestrians:
         )
         self._count = 0
         self._room = Room(street_map, spec.radius_m)
+        self._companies = Companies(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Everybody at once, before the episode."""
@@ -141,27 +108,37 @@ class Pedestrians:
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
     def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]) -> None:
-        """Take out who is far away or stuck, let others in instead.
+        """Take out who is far away or stuck, with all who walk along; let others in instead; keep groups together.
 
         seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at a red light.
         """
         person, radius_m = self._engine.person, self._spec.radius_m
-        for name in sorted(person.getIDList()):
-            if not name.startswith("c"):
-                continue
+        fellows = self._together.fellows
+        present = sorted(name for name in person.getIDList() if name.startswith("c"))
+        self._together.forget(present)
+        for name in present:
             here = seen.get(name)
-            if here is None or (here.waiting_s > STUCK_S and not at_red(name)):
-                person.remove(name)
+            if here is None or (here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))):
+                self._remove(name)
         away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]
         low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
         missing = self.wanted(x_m, y_m) - len(inside)
         if not isinstance(self._spec.density, msgspec.UnsetType):
             far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
-            for name in far[: max(-missing, 0)]:
-                if name in person.getIDList():
-                    person.remove(name)
+            spare = -missing - (0 if self._companies.plain else 1)
+            for name in far:
+                if len(fellows(name)) <= spare:
+                    spare -= len(fellows(name))
+                    self._remove(name)
+        self._together.keep(seen)
         self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
+
+    def _remove(self, name: str) -> None:
+        """Take somebody who is still there out, with all who walk along."""
+        if name in self._engine.person.getIDList():
+            for fellow in self._together.leave(name):
+                self._engine.person.remove(fellow)
 
     def _margin_m(self, port: Port) -> float:
         return self._widths_m[port.strip] + END_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
@@ -171,19 +148,32 @@ class Pedestrians:
             return
         taken = [(p.x_m, p.y_m) for p in seen.values()]
         for _ in range(4 * count):
+            company = self._companies.coming
+            if 2 * count < company.size:
+                return
             spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
-            forward, speed_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*PERSON_MPS))
-            half_m = max(self._widths_m[spot.edge] / 2 - EDGE_M, 0.0)
-            x, y = shifted(spot.pose, float(self._rng.uniform(-half_m, half_m)))
-            if any(np.hypot(x - other_x, y - other_y) < PERSONAL_SPACE_M for other_x, other_y in taken):
+            forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*company.pace_mps))
+            width_m = self._widths_m[spot.edge]
+            half_m = max(width_m / 2 - EDGE_M - (company.abreast(width_m) - 1) * STRIPE_M / 2, 0.0)
+            middle_m = float(self._rng.uniform(-half_m, half_m))
+            back = -1.0 if forward else 1.0
+            places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in company.places(width_m)]
+            if any(
+                np.hypot(x - other_x, y - other_y) < PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
+            ):
                 continue
             walk = self._graph.wander(self._rng, spot.edge, forward, WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
-            self._add(spot, self._one_way(walk, forward), speed_mps, (x, y))
-            taken.append((x, y))
-            count -= 1
-            if count == 0:
+            walk, speed_mps = self._one_way(walk, forward), company.walks_at(drawn_mps)
+            names = [self._name(age) for age in company.ages]
+            for name, xy in zip(names, places, strict=True):
+                self._add(name, spot, walk, speed_mps, xy)
+            self._together.join(names, speed_mps, walk)
+            self._companies.entered()
+            taken += places
+            count -= company.size
+            if count <= 0:
                 return
 
     def _one_way(self, walk: list[str], forward: bool) -> list[str]:
@@ -196,10 +186,15 @@ class Pedestrians:
         corner = self._graph.street_map.strips[walk[0]].corners[1 if forward else 0]
         return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
-    def _add(self, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
-        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
-        name = f"c{self._count}"
+    def _name(self, age: str) -> str:
+        """The next name; a person's age follows from the name, so if it matters, the next name of that age."""
+        while age and age_of(f"c{self._count}") != age:
+            self._count += 1
         self._count += 1
+        return f"c{self._count - 1}"
+
+    def _add(self, name: str, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
+        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
         self._engine.person.add(name, spot.edge, spot.share * first_m)
         self._engine.person.appendWalkingStage(name, walk, last_m / 2, speed=speed_mps)

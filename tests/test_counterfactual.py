@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import pandas as pd
 import pytest
 
@@ -57,10 +58,11 @@ def nobody(tick: int) -> EventReply:
 
 
 def test_a_street_without_a_robot_is_itself_when_it_is_simulated_again(scenario: Scenario) -> None:
-    """Nobody is there either time: the same people and vehicles at the same places, to the last bit."""
+    """Nobody is there either time: the same people, groups too, and vehicles at the same places, to the last bit."""
     robot = RobotState(Pose(*scenario.start))
-    before, entrances = streets(scenario, robot, absent=True)
-    for a, b in zip(before, once_more(scenario, robot, entrances), strict=True):
+    grouped = msgspec.structs.replace(scenario, crowd=CrowdSpec(groups=0.5))
+    before, entrances = streets(grouped, robot, absent=True)
+    for a, b in zip(before, once_more(grouped, robot, entrances), strict=True):
         assert (a.people.ids, a.vehicles.ids) == (b.people.ids, b.vehicles.ids)
         assert a.people.xy.tobytes() == b.people.xy.tobytes()
         assert a.vehicles.xy.tobytes() == b.vehicles.xy.tobytes()

@@ -31,7 +31,7 @@ from physics.people.poses import poses
 from physics.placement import CLEAR_HALF_M
 from physics.tiles import key_at
 from scenarios.barriers import outline
-from scenarios.catalog import suite, with_residents
+from scenarios.catalog import suite, with_crowd
 from scenarios.residents.director import GONE_M, WITHIN_M, Residents
 from scenarios.residents.graph import OFF_WALK_M, BehaviorGraph, behavior_graph
 from scenarios.residents.resident import SPEED_MPS, STAYS_S, Resident
@@ -304,7 +304,7 @@ def test_a_crowd_without_residents_is_what_it_was() -> None:
     shipped = suite("long-horizon")
     proven = msgspec.json.decode((Path(__file__).parents[1] / "scenarios/suites/long-horizon.proof.json").read_bytes())
     assert content_hash(shipped.scenarios[0]) == proven[0]["scenario_hash"]
-    settled = with_residents(shipped, 8)
+    settled = with_crowd(shipped, residents=8)
     assert settled.version != shipped.version and settled.content_hash != shipped.content_hash
     one = msgspec.json.decode(msgspec.json.encode(settled.scenarios[0]), type=Scenario)
     assert one.crowd == CrowdSpec(residents=8) and one == settled.scenarios[0]
@@ -321,7 +321,7 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     from scenarios.replay import Recorded, compared
     from scenarios.run import episode
 
-    whole = with_residents(suite("long-horizon"), 6)
+    whole = with_crowd(suite("long-horizon"), residents=6)
     scenario = msgspec.structs.replace(whole.scenarios[0], time_limit_s=12.0)
     names: set[str] = set()
 
