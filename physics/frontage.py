@@ -17,12 +17,14 @@ from cosim.geometry import Floats, Polyline
 from cosim.streetmap import StreetMap, Strip
 from physics.mapped import MappedThings
 from physics.materials import street_of
-from physics.mesh import Mesh, join
+from physics.mesh import Mesh, join, quads
 from physics.placement import street_style
 from physics.tiles import DRIVEWAY_M, Tile, square
 
 Colour = tuple[float, float, float]
 _LIFT_M: Final = 0.003
+_GRID_M: Final = 1e-4
+"""Ends of edges nearer to one another than about this are the same."""
 _REACH_M: Final = 12.0
 _UNDER_M: Final = 0.6
 """So far it reaches under the houses, whose fronts are straight where a street bends."""
@@ -86,7 +88,7 @@ def frontage_in(street_map: StreetMap, tile: Tile, seed: int, mapped: MappedThin
     taken: shapely.Geometry = shapely.Polygon()
     for cover in sorted(areas, key=lambda cover: (cover not in _WAYS, cover.layer, cover.colour or ())):
         area = shapely.union_all(areas[cover])
-        found.append(Laid(_clipped(triangles, shapely.difference(area, taken)), cover))
+        found.append(Laid(_edged(_clipped(triangles, shapely.difference(area, taken))), cover))
         taken = shapely.union(taken, area)
     return [laid for laid in found if len(laid.mesh)]
 
@@ -155,6 +157,24 @@ def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
         if shapely.area(part) > 1e-4:
             found.append(_cut(part, corners[i], mesh.normals[mesh.triangles[i]]))
     return join(found)
+
+
+def _edged(mesh: Mesh) -> Mesh:
+    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look under it."""
+    if not len(mesh):
+        return mesh
+    corners = mesh.vertices[mesh.triangles]
+    ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    grid = np.rint(ends[:, :, :2] / _GRID_M).astype(np.int64)
+    one, two = (np.ascontiguousarray(grid[:, i]).view("i8,i8").ravel() for i in (0, 1))
+    order = {(a, b): k for k, (a, b) in enumerate(zip(one.tolist(), two.tolist(), strict=True))}
+    alone = ends[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
+    if not len(alone):
+        return mesh
+    under = alone - np.array([0.0, 0.0, _LIFT_M])
+    rim = quads(np.stack([under[:, 0], under[:, 1], alone[:, 1], alone[:, 0]], axis=1))
+    lit = np.tile([0.0, 0.0, 1.0], (len(rim.vertices), 1))  # like the surface: a millimetre's wall would be a dark line
+    return join([mesh, Mesh(rim.vertices, lit, rim.triangles)])
 
 
 def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:

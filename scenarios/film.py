@@ -45,7 +45,7 @@ ABOVE_SLANT: Final = 0.22
 """From above the eye is behind what it looks at by this share of its height."""
 ABOVE_REST: Final = (2.0, 0.0, 10.0)
 """What it looks at when nothing happens, metres ahead and to the left of the robot, and how high it is."""
-ABOVE_HIGH_M: Final = (7.5, 12.0)
+ABOVE_HIGH_M: Final = (6.5, 12.0)
 NEAR_M: Final = 8.0
 """Event people this near are kept in the picture from above."""
 

@@ -221,26 +221,33 @@ def test_domes_lie_in_the_triangles_of_the_ground() -> None:
 
 
 def test_the_frontage_is_paved_where_there_are_shops() -> None:
-    """Before shops it is covered from the sidewalk to the houses, without holes or doubles, a little above the ground;
-    a home's driveway reaches from its sidewalk to the houses; the ground itself stays what it was."""
+    """Before shops it is covered from the sidewalk to the houses, without holes or doubles, a little above the ground,
+    with a rim down to it where it ends; a home's driveway reaches from its sidewalk to the houses; the ground itself
+    stays what it was."""
     changed = {
         "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
         "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
     }
     street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, _trees={})
-    covered, layers = [], set()
+    covered, layers, rims = [], set(), []
     for key in KEYS:
         tile = build_tile(street_map, key)
         assert set(tile.parts) - {"ramp"} == set(TILES[key].parts) - {"ramp"}
         for mesh, cover in frontage_in(street_map, tile, 3):
             layers.add(cover.layer)
             above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
-            assert above.min() > 0.002 and above.max() < 0.004
-            covered.append(shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2]))
+            faces = mesh.vertices[mesh.triangles]
+            flat = np.abs(plan_areas(faces)) > 1e-9
+            assert above[mesh.triangles[flat]].min() > 0.002 and above.max() < 0.004
+            rim = mesh.triangles[~flat]
+            assert above.min() > -0.001 and above[rim].min(axis=1).max() < 0.001
+            edge = mesh.vertices[rim].reshape(-1, 3)
+            rims += np.abs(edge[np.abs(edge[:, 1] - 6.5) < 1e-3, 0]).tolist()
+            covered.append(shapely.polygons(faces[flat][:, :, :2]))
     pieces = np.concatenate(covered)
     whole = shapely.union_all(pieces, grid_size=1e-6)
     assert shapely.area(pieces).sum() == pytest.approx(whole.area, rel=1e-4)
     assert whole.covers(shapely.box(-55.0, 6.51, -3.0, 8.49))
     assert whole.covers(shapely.box(30.6, 6.51, 33.4, 8.49))
     assert whole.intersection(shapely.box(-55.0, -8.0, 55.0, 6.45)).area < 1e-6
-    assert len(layers) >= 2
+    assert len(layers) >= 2 and max(rims) > 30.0 > min(rims)
