@@ -8,20 +8,24 @@ import subprocess
 import sys
 
 import msgspec
+import numpy as np
 import pytest
 
 from cosim.errors import MapError
+from cosim.events import Actor, EventReply
+from cosim.geometry import Polyline, boxes_overlap
 from cosim.policies.route import bearing_to
 from cosim.ports import Manifest, Observation
 from cosim.referee import Verdict
 from cosim.roadway import braking_for
 from cosim.scenario import City, CrowdSpec
-from cosim.state import Command
+from cosim.state import Command, RobotState
 from cosim.step import Step
 from cosim.walks import WalkGraph
 from scenarios.assemble import place
 from scenarios.crossings import AFTER_M, BEFORE_M, build_all
 from scenarios.run import episode
+from sumo_nets.crowd import SumoCrowd
 
 pytestmark = pytest.mark.engine
 
@@ -100,3 +104,22 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
     assert measures["vehicles_braked"] == 1 and min(slowest.values()) < 0.1
     assert measures["collisions_vehicle"] == 0
     assert measures["carriageway_time_s"] is not None and measures["carriageway_time_s"] > 10.0
+
+
+@pytest.mark.parametrize("who", ["nobody", "robot", "person"])
+def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
+    """In a minute of traffic cars drive over the middle of a crossing; where a robot or a person stands, none does."""
+    net, street_map = place(SMALL)
+    crossing = Polyline(street_map.strips[":n1x2_c1"].line[:, :2])
+    assert not street_map.strips[":n1x2_c1"].signalised
+    middle = crossing.at(0.5 * crossing.length_m)
+    here = np.array([0.35, 0.275])
+    guest = Actor(id="e0", x_m=middle.x_m, y_m=middle.y_m, heading_rad=middle.heading_rad, speed_mps=0.0, doing="stand")
+    over: set[str] = set()
+    with SumoCrowd(net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]) as crowd:
+        for tick in range(1200):
+            reply = EventReply(episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ())
+            cars = crowd.step(RobotState(middle), reply, absent=who != "robot").vehicles
+            boxes = np.column_stack([cars.xy, cars.heading])
+            over |= {cars.ids[i] for i in np.flatnonzero(boxes_overlap(np.array(middle), here, boxes, cars.size / 2))}
+    assert bool(over) is (who == "nobody")

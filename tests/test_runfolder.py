@@ -68,7 +68,10 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
         RunFolder.resume(tmp_path / "run", SPEC).__enter__()
 
 
-@pytest.mark.parametrize(("field", "value"), [("policy", "q"), ("suite_hash", "0"), ("versions", {"numpy": "1"})])
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("policy", "q"), ("suite_hash", "0"), ("versions", {"numpy": "1"}), ("counterfactual", True)],
+)
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
     """Another policy, suite or version would mix two runs: the difference is named."""
     RunFolder.create(tmp_path / "run", SPEC, SUITE)
