@@ -77,7 +77,8 @@ void main() {{
     float every = floor(fronts.z / 16.0);
     float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
     float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {VARIANTS}.0);
-    vec4 bay = texture(facades, vec3(cells.x, -cells.y, layer));
+    float up = ground_floor ? clamp(cells.y, 0.006, 0.994) : cells.y;  // its plinth does not show over its top
+    vec4 bay = texture(facades, vec3(cells.x, -up, layer));
     bool none = cell.y < 0.0 || cell.y >= kind.y;
     albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
     vec3 own = vec3(0.0);
