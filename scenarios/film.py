@@ -41,10 +41,8 @@ ROBOT_FOV_DEG: Final = 75.0
 ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
 FOV_DEG: Final = 62.0
 """Of the views from behind and from above, up and down."""
-ABOVE_SLANT: Final = 0.22
-"""From above the eye is behind what it looks at by this share of its height."""
 ABOVE_REST: Final = (2.0, 0.0, 10.0)
-"""What it looks at when nothing happens, metres ahead and to the left of the robot, and how high it is."""
+"""From above, when nothing happens: metres ahead and to the left of the robot that are looked at, height of the eye."""
 ABOVE_HIGH_M: Final = (6.5, 12.0)
 NEAR_M: Final = 8.0
 """Event people this near are kept in the picture from above."""
@@ -165,7 +163,7 @@ class _Reel:
         if view == "follow":
             eye, target = behind(robot, self._ahead)
         else:
-            eye, target = over(robot, self._ahead, self._over, ABOVE_SLANT)
+            eye, target = over(robot, self._ahead, self._over)
         return self._camera.picture(eye, target, street, robot, (area.width, area.height), FOV_DEG).rgb
 
     def _note(self, step: Step, verdict: Verdict) -> None:

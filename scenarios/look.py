@@ -27,9 +27,9 @@ VIEWS: Final[tuple[View, ...]] = ("robot", "follow", "above")
 BEHIND_M: Final = 4.6
 ABOVE_M: Final = 2.5
 AHEAD_M: Final = 3.0
-HIGH_M: Final = 28.0
-OVER_SLANT: Final = 0.55
-"""From above the eye is behind what it looks at by this share of its height."""
+HIGH_M: Final = 24.0
+OVER_SLANT: Final = 0.22
+"""From above the eye is behind what it looks at by this share of its height: little, or a house may stand between."""
 
 
 class _Reached(Exception):
@@ -79,7 +79,6 @@ def over(
     robot: RobotState,
     ahead: Floats | None = None,
     at_m: ArrayLike = (0.0, 0.0, HIGH_M),
-    slant: float = OVER_SLANT,
 ) -> tuple[Floats, Floats]:
     """(eye, target), (3,) metres: from high above, a little behind, down on the robot or what is near it.
 
@@ -88,7 +87,7 @@ def over(
     way = _way(robot, ahead)
     forward_m, left_m, high_m = np.asarray(at_m, dtype=float).tolist()
     foot = robot.pose.xy + forward_m * way + left_m * np.array([-way[1], way[0]])
-    return np.append(foot - slant * high_m * way, robot.z_m + high_m), np.append(foot, robot.z_m)
+    return np.append(foot - OVER_SLANT * high_m * way, robot.z_m + high_m), np.append(foot, robot.z_m)
 
 
 def _way(robot: RobotState, ahead: Floats | None) -> Floats:
