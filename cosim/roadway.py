@@ -1,7 +1,8 @@
 """The robot among vehicles: whether it is on the carriageway without right, and which vehicles it makes brake.
 
-- carriageway: the base centre is on a road outside the crossings, or on a crossing whose signal says stop. A sidewalk
-  or corner that reaches over a lane is no road; the inside of a junction is.
+- carriageway: the base centre is on a road outside the crossings, or on a crossing whose signal says stop, between
+  the ends of its line: what closes the seam before its kerb is no road. Nor is a sidewalk or corner that reaches over
+  a lane; the inside of a junction is.
 - braked: a vehicle slows down by more than BRAKES_MPS2 while the robot, on the carriageway or on a crossing that gives
   it no green, is the nearest body in the vehicle's straight way. Once per vehicle until it has not done so for APART_S.
   At a green crossing vehicles stop for their own red light or for whoever walks: that is not counted.
@@ -55,7 +56,8 @@ class Roadway:
         crossing = strip is not None and strip.kind == "crossing"
         signal = step.street.signals.get(place.edge) if crossing else None
         inside = place.kind == "off" and bool(self._map.near("junction", shapely.Point(pose.x_m, pose.y_m)))
-        carriageway = place.kind == "road" or inside or (signal is not None and not signal.walk)
+        at_red = strip is not None and signal is not None and not signal.walk and between_its_ends(strip, pose)
+        carriageway = place.kind == "road" or inside or at_red
         if not carriageway and (not crossing or signal is not None):
             return OnRoad()
         names = braking_for(pose, step.street, step.street_after, self._tick_s)
@@ -78,6 +80,13 @@ class Roadway:
             shapely.prepare(piece)
             self._beside[edge] = piece
         return self._beside[edge]
+
+
+def between_its_ends(strip: Strip, pose: Pose) -> bool:
+    """Whether a point of a strip lies beside its line, and not beyond one of its ends."""
+    first, last = strip.line[0, :2], strip.line[-1, :2]
+    along = last - first
+    return bool(0.0 < (pose.xy - first) @ along < along @ along)
 
 
 def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,9 +17,10 @@ from cosim.loop import ask
 from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
+from cosim.policies.route import crossing_limit
 from cosim.ports import Observation, Privileged
 from cosim.scenario import City
-from cosim.state import NO_VEHICLES, Doing, People, RobotState, Vehicles
+from cosim.state import NO_VEHICLES, Doing, People, RobotState, Signal, Vehicles
 
 CITY = City(seed=1, size_m=500.0)
 ROUTE = Polyline([(0.0, 0.0), (30.0, 0.0)])
@@ -72,6 +74,17 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
         x_m += 0.1 * v_mps
     assert v_mps == 0.0
     assert 12.0 - x_m == pytest.approx(STOP_BEFORE_M, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("walk", "v_mps", "limit_mps"), [(False, 0.02, 0.0), (False, 1.2, math.inf), (True, 0.0, math.inf)]
+)
+def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
+    walk: bool, v_mps: float, limit_mps: float
+) -> None:
+    """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives on."""
+    here = replace(known(people(), 5.0, v_mps), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(walk, 30.0)})
+    assert crossing_limit(here) == limit_mps
 
 
 def test_foresight_turns_no_faster_than_the_robot() -> None:

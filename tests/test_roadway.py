@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -100,3 +100,12 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
         assert kept.see(this) == Roadway(street_map, 0.05).see(this)
         if tick == 99:
             assert len(looks) == 1
+
+
+def test_who_waits_on_the_seam_before_a_red_crossing_is_not_on_the_road() -> None:
+    """The crossing's ground reaches half a metre beyond its line, to the kerb: only between the ends is it road."""
+    seamed = replace(CROSSING, polygon=shapely.box(18.0, -4.5, 22.0, 4.5))
+    street_map = StreetMap("m", MAP.bounds, {":j_c0": seamed}, {}, {}, {})
+    after = street(0.0, walk=False)
+    seen = [Roadway(street_map, 0.05).see(step(0, 20.0, y_m, after, after)).carriageway for y_m in (4.3, 3.9, -4.3)]
+    assert seen == [False, True, False]

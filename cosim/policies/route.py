@@ -35,6 +35,8 @@ CAR_BRAKE_MPS2 = 3.0
 STOP_SHORT_M = 0.9
 """Distance of the base centre from the edge of a crossing that it waits at."""
 
+HELD_MPS = 0.1
+"""A robot that is slower has stopped at red, and does not start because it has crept nearer."""
 HALF_LENGTH_M = 0.35
 BODY_RADIUS_M = 0.33
 """The body as two disks, fore and aft."""
@@ -110,7 +112,8 @@ def crossing_limit(known: Privileged) -> float:
             may_enter = signal.walk and (signal.changes_in_s is None or signal.changes_in_s > needs_s)
         else:
             may_enter = not car_coming(known, enter_s_m, leave_s_m)
-        if not may_enter and before_m > HALF_LENGTH_M:
+        waits = before_m > HALF_LENGTH_M or (signal is not None and known.robot.v_mps < HELD_MPS)
+        if not may_enter and waits:
             room_m = before_m - STOP_SHORT_M
             return math.sqrt(2.0 * BRAKE_MPS2 * room_m) if room_m > 0.05 else 0.0
     return math.inf
