@@ -229,3 +229,25 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
     again, _ = run(200)
     for a, b in zip(streets, again, strict=False):
         assert a.people.ids == b.people.ids and a.people.xy.tobytes() == b.people.xy.tobytes()
+
+
+@pytest.mark.engine
+def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where everybody who does not wait at red is taken out at the next look, all who walk along leave in that tick."""
+    monkeypatch.setattr("sumo_nets.demand.STUCK_S", -1.0)
+    net = tmp_path / "city.net.xml"
+    build_city(City(seed=2, size_m=600.0), net)
+    street_map = read_net(net)
+    x0, y0, x1, y1 = street_map.bounds
+    start = Pose((x0 + x1) / 2, (y0 + y1) / 2, 0.0)
+    spec = CrowdSpec(persons=80, vehicles=10, groups=0.9)
+    left = 0
+    with SumoCrowd(net, street_map, spec, 3, frozenset(), start[:2]) as crowd:
+        for tick in range(60):
+            groups, before = crowd.groups, set(crowd.street.people.ids)
+            reply = EventReply(episode="test", tick=tick, states=(), actors=())
+            after = set(crowd.step(RobotState(start), reply).people.ids)
+            whole = [set(names) for names in groups if set(names) <= before]
+            left += sum(not names & after for names in whole)
+            assert tick % 10 or all(names <= after or not names & after for names in whole)
+    assert left > 10
