@@ -23,8 +23,11 @@ NEAR_M: Final = 4.0
 HORIZON_S: Final = 2.0
 """How far ahead one looks; half-planes too."""
 
+ROOM_M: Final = 2 * PERSON_RADIUS_M
+"""Middles of two people who pass keep so far apart, as long as that leaves a way."""
+
 LEAST_M: Final = 0.45
-"""Middles of two people who touch shoulders; nearer ones part."""
+"""Middles of two people who touch shoulders: one squeezes through where nothing else is open. Nearer ones part."""
 
 PARTED_S: Final = 0.5
 """In this time those who are too near are parted."""
@@ -74,24 +77,28 @@ def steered(
     neighbours: Sequence[Neighbour],
     *,
     horizon_s: float = HORIZON_S,
+    room_m: float = ROOM_M,
     walls: Sequence[HalfPlane] = (),
 ) -> Vector:
     """The velocity (m/s) of one person who is at `at_m`, moves with `moving_mps` and wants `wanted_mps`.
 
     No faster than wanted; exactly as wanted, to the bit, where nobody is in the way. One who wants to stand stands.
-    horizon_s: how far ahead to look; less for one who arrives before. walls: half-planes of velocities that stay on
+    horizon_s: how far ahead to look; less for one who arrives before. room_m: between middles, where that is to be had;
+    less for one in a hurry. walls: half-planes of velocities that stay on
     the ground one may walk on. Only who is nearer than NEAR_M counts, and of those behind only who is too near.
     """
     speed_mps = math.hypot(*wanted_mps)
     if speed_mps < EPS:
         return wanted_mps
-    disks = _seen(at_m, wanted_mps, neighbours)
+    disks = _seen(at_m, wanted_mps, neighbours, room_m)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
     if math.dist(moving_mps, wanted_mps) < EPS and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s:
         return wanted_mps
-    minded = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
-    heading_mps = _most_open(wanted_mps, moving_mps, minded, walls, horizon_s)
+    heading_mps, is_open = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
+    if not is_open:
+        disks = _seen(at_m, wanted_mps, neighbours, LEAST_M)
+        heading_mps, _ = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
     planes = [half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S) for d in disks]
     planes += walls
     if all(_permits(plane, *heading_mps) for plane in planes):
@@ -100,15 +107,15 @@ def steered(
     return x_mps, y_mps
 
 
-def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour]) -> list[_Disk]:
-    """Those who count, with the distance to keep from each: two radii, or what there is between them now."""
+def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], room_m: float) -> list[_Disk]:
+    """Those who count, with the distance to keep from each: `room_m`, or what there is between them now."""
     disks = []
     for one in neighbours:
         dx, dy = one.x_m - at_m[0], one.y_m - at_m[1]
         far_m = math.hypot(dx, dy)
         ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
         if far_m < NEAR_M and (ahead or far_m < LEAST_M):
-            keep_m = min(2 * PERSON_RADIUS_M, max(GIVES * far_m, LEAST_M))
+            keep_m = min(room_m, max(GIVES * far_m, LEAST_M))
             room_m2 = dx * dx + dy * dy - keep_m * keep_m
             disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks
@@ -123,25 +130,27 @@ def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
 
 def _most_open(
     wanted_mps: Vector, moving_mps: Vector, disks: Sequence[_Disk], walls: Sequence[HalfPlane], horizon_s: float
-) -> Vector:
-    """The wanted velocity, turned no more than needed to meet nobody within the horizon; else to meet the latest.
+) -> tuple[Vector, bool]:
+    """The wanted velocity, turned no more than needed to meet nobody within the horizon, and True; else to meet the
+    latest, and False.
 
     Of two that are turned alike, that on the side to which one moves already; to the right for who moves straight.
     """
     x, y = wanted_mps
+    disks = [disk for disk in disks if not _lets_pass(disk, wanted_mps)]
     best, latest_s = wanted_mps, _meets_in_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
-        return best
+        return best, True
     side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > EPS else -1.0
     for cos, sin in TURNS:
         for aside in (side * sin, -side * sin):
             turned = (cos * x - aside * y, aside * x + cos * y)
             in_s = _meets_in_s(*turned, disks, walls, horizon_s, latest_s)
             if in_s >= horizon_s:
-                return turned
+                return turned, True
             if in_s > latest_s:
                 best, latest_s = turned, in_s
-    return best
+    return best, False
 
 
 def _meets_in_s(

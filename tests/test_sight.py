@@ -157,3 +157,25 @@ def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these
     assert [(b.vx_mps, b.vy_mps) for b in told] == [pytest.approx((0.0, 1.0)), pytest.approx((0.0, 0.5))]
     crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
     assert bystanders(crowd, [event("conversing")]) == bystanders(NOBODY, []) == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "people", "side", "standing"),
+    [
+        ("queueing", 5, -1, [(51.16, 0.18), (52.06, -0.54)]),
+        ("conversing", 3, -1, [(53.27, 1.28), (47.61, 0.54)]),
+        ("gesturing", 1, 1, [(50.31, 0.35), (47.0, 1.5)]),
+        ("obstructing", 1, 1, [(50.0, 0.5), (50.5, 0.3), (49.5, 0.3), (49.8, -0.4), (50.3, -0.4)]),
+    ],
+)
+def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
+    kind: Kind, people: int, side: int, standing: list[tuple[float, float]]
+) -> None:
+    """Where people stand in the way and close to the places, everybody is there within 8 s and stays."""
+    crowd = [Bystander(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
+    track = drive(event(kind, people=people, side=side), 300, 0.1, 40.0, *crowd)
+    late, last = track[160][1].states[0], track[-1][1].states[0]
+    assert (late.phase, last.phase) == ("acting", "acting")
+    assert [(w.x_m, w.y_m) for w in late.walkers] == [(w.x_m, w.y_m) for w in last.walkers]
+    alone = drive(event(kind, people=people, side=side), 300, 0.1, 40.0)[-1][1].states[0]
+    assert [(w.x_m, w.y_m) for w in last.walkers] == [(w.x_m, w.y_m) for w in alone.walkers]

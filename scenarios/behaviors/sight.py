@@ -9,7 +9,7 @@ from typing import NamedTuple
 from cosim.events import Bystander, Event, EventQuery, Walker
 from cosim.orca import HalfPlane
 from cosim.state import PERSON_RADIUS_M
-from cosim.steering import HORIZON_S, LEAST_M, Neighbour, Vector, steered
+from cosim.steering import HORIZON_S, LEAST_M, ROOM_M, Neighbour, Vector, steered
 
 COMES_UP_M = 1.5
 """From here on, who insists on a place walks up to whoever is there, not round."""
@@ -20,20 +20,32 @@ BESIDE_M = 1.0
 STILL_MPS = 0.1
 """Slower ones stand."""
 
+SQUEEZES_S = 3.0
+PRESSES_S = 6.0
+"""Who insists on a place and is not there after the first time squeezes through; after the second the crowd gives
+way."""
+
 SHARED = 0.5
 """Of the avoidance between two who steer the same way."""
 
 
 class Sight(NamedTuple):
-    """What somebody knows: the query, the people round it but not itself, the event on whose ground it stays."""
+    """What somebody knows: the query, the people round it but not itself, the event on whose ground it stays.
+
+    room_m: what it keeps from others where it can.
+    """
 
     query: EventQuery
     others: Sequence[Neighbour] = ()
     event: Event | None = None
+    room_m: float = ROOM_M
 
 
-def sight_of(event: Event, number: int, query: EventQuery) -> Sight:
-    """The sight of person `number` of an event: it sees its fellows, people of other events, and bystanders."""
+def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
+    """The sight of person `number` of an event: it sees its fellows, people of other events, and bystanders.
+
+    waited_s: how long it has been on its way to a place on which it insists.
+    """
     others = [
         fellow(walker)
         for one, state in zip(query.events, query.states, strict=False)
@@ -41,7 +53,9 @@ def sight_of(event: Event, number: int, query: EventQuery) -> Sight:
         for k, walker in enumerate(state.walkers)
         if (one.id, k) != (event.id, number)
     ]
-    return Sight(query, others + met(query.bystanders), event)
+    if waited_s < PRESSES_S:
+        others += met(query.bystanders)
+    return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else LEAST_M)
 
 
 def sight_of_guest(name: str, query: EventQuery) -> Sight:
@@ -96,6 +110,7 @@ def led_round(
         velocity,
         others,
         horizon_s=horizon_s,
+        room_m=sight.room_m,
         walls=edges(walker, wanted, sight.event, tick_s),
     )
     return wanted if (vx, vy) == velocity else (at[0] + vx * tick_s, at[1] + vy * tick_s)

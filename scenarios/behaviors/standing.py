@@ -72,7 +72,9 @@ def _standing(places: Callable[[Event], tuple[Place, ...]], facing: Facing, doin
         for number, (walker, goal) in enumerate(zip(state.walkers, goals, strict=True)):
             x_m, y_m = spot(event, *goal)
             if (walker.x_m, walker.y_m) != (x_m, y_m):
-                sight, insisting = sight_of(event, number, query), state.phase == "acting"
+                insisting = state.phase == "acting"
+                waited_s = (query.tick - state.since_tick) * tick_s if insisting else 0.0
+                sight = sight_of(event, number, query, waited_s)
                 walkers.append(walked_to(walker, x_m, y_m, event.speed_mps, sight, insisting=insisting))
             elif state.phase == "acting":
                 heading = turned(walker.heading_rad, facing(event, walker, query, state), tick_s)
