@@ -12,6 +12,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.geometry import Floats, Pose
 from cosim.state import PERSON_RADIUS_M
@@ -19,6 +20,8 @@ from cosim.state import PERSON_RADIUS_M
 KEEP_M = 0.12
 """Gap between a person's disk and the robot's outline at which the person begins to step round."""
 
+DRAWS_BACK_M = 0.015
+"""Who stands nearer to the robot than KEEP_M goes back by this in a step of 0.05 s."""
 
 TOUCH_M = 0.01
 FORESEEN_S = 0.6
@@ -38,13 +41,14 @@ def within_reach_m(body: Body) -> float:
     return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + KEEP_M
 
 
-def stepped_round(before: Floats, wanted: Floats, body: Body) -> Floats:
+def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.bool_] | None = None) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
 
     People keep out of the ground that a moving robot is about to cover, too: who walks against it there steps aside.
     Apart from that a step towards the robot from nearer than KEEP_M loses its
     inward part; its length goes into the way round: to the side on which the step would pass the robot's centre.
-    That choice strengthens itself, so nobody dithers.
+    That choice strengthens itself, so nobody dithers. stand (N,): who only wants to stand there comes up as near as it
+    can and draws back slowly from a robot that is nearer than KEEP_M: it would go round it and back for ever.
     """
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
     turn = np.array([[cos, -sin], [sin, cos]])
@@ -67,6 +71,10 @@ def stepped_round(before: Floats, wanted: Floats, body: Body) -> Floats:
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
     slides = (_gap(near, low, high) < KEEP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
+    if stand is not None:
+        back = np.clip(KEEP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
+        comes_up = slides & stand
+        moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
 
     meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < KEEP_M)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)

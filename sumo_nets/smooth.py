@@ -74,9 +74,10 @@ class PoseFilter:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
-        shown = self._apart(before, shown, others, speed < STANDING_MPS)
+        stand = speed < STANDING_MPS
+        shown = self._apart(before, shown, others, stand)
         if body is not None:
-            shown = stepped_round(before, shown, body)
+            shown = stepped_round(before, shown, body, stand)
         velocity = (shown - before) / self.period_s
         velocity[new] = simulated
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)

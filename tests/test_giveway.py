@@ -66,3 +66,18 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
     before = np.array([[0.8, 0.0]])
     wanted = before + np.array([[0.03, 0.0]])
     assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)
+
+
+@pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
+def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
+    """Somebody who waits comes up to the robot, a hand's breadth away, and then stands still."""
+    body, place = Body(Pose(0.0, 0.0, 0.0), HALF), np.array([x_m, 0.45])
+    xy, ways = np.array([[2.0, 1.2]]), []
+    for _ in range(100):
+        away = place - xy
+        step = away * (0.11 / max(float(np.hypot(*away[0])), 0.11))
+        after = stepped_round(xy, xy + step, body, np.array([True]))
+        ways.append(float(np.hypot(*(after - xy)[0])))
+        xy = after
+    assert sum(ways[60:]) < 1e-4
+    assert KEEP_M - 1e-6 < gap(xy, body.pose) < KEEP_M + 0.11
