@@ -69,7 +69,7 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
 
 def first_query(scenario: Scenario) -> EventQuery:
     """What a director is asked at the first tick."""
-    return query(scenario, Clock(), 0, RobotState(scenario.start_pose), 0.0, (0.7, 0.55), ())
+    return query(scenario, Clock(), 0, RobotState(scenario.start_pose), NOBODY, 0.0, (0.7, 0.55), ())
 
 
 @pytest.mark.parametrize("name", SUITES)
