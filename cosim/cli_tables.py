@@ -117,18 +117,20 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
 
 
 def print_sheet(out: Console, folder: Path) -> None:
-    """What was measured of each event of a run, and a summary by kind."""
+    """What was measured of each event of a run, and two summaries by kind: made for 80 columns."""
     from scenarios.eventsheet import sheet_of_run, summary
 
     sheet = sheet_of_run(folder)
-    heads = ("trigger m", "error", "tick", "m/s", "stated", "left m", "angle", "least m")
-    rows = Table(Column("episode", no_wrap=True), "event", *heads, box=box.SIMPLE_HEAD)
+    heads = ("trigger", "error", "tick", "m/s", "stated", "left", "angle", "least")
+    rows = Table(Column("episode", no_wrap=True), *(Column(head, justify="right") for head in heads), box=None)
     for row in sheet.itertuples(index=False):
-        numbers = (f"{value:.3f}" if i in (1, 2) else f"{value:.2f}" for i, value in enumerate(row[2:]))
-        rows.add_row(row[0], row[1], *("-" if n == "nan" else n for n in numbers))
+        name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
+        numbers = (f"{value:.{digits}f}" for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True))
+        rows.add_row(name, *("-" if n == "nan" else n for n in numbers))
     out.print(rows)
-    short = summary(sheet)
-    table = Table(*short.columns, box=box.SIMPLE_HEAD)
-    for row in short.itertuples(index=False):
-        table.add_row(*(str(value) for value in row))
-    out.print(table)
+    for short in summary(sheet):
+        columns = (Column(head, no_wrap=True) for head in short.columns)
+        table = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for row in short.itertuples(index=False):
+            table.add_row(*(str(value) for value in row))
+        out.print(table)

@@ -19,15 +19,17 @@ from cosim.geometry import Floats, wrap_angles
 from cosim.record import Log, Record
 from cosim.runfolder import read_records
 from cosim.scenario import Scenario, read_suite
-from scenarios.behaviors import frontal, lateral, standing
+from scenarios.behaviors import frontal, lateral, overtaking, standing
 
 TRIGGERS_M: Final[Mapping[Kind, float]] = MappingProxyType(
     {
         "obstructing": standing.TRIGGER_M, "conversing": standing.TRIGGER_M, "queueing": standing.TRIGGER_M,
-        "gesturing": standing.TRIGGER_M, "frontal": frontal.TRIGGER_M, "lateral": lateral.TRIGGER_M, "overtaking": 0.0,
+        "gesturing": standing.TRIGGER_M, "frontal": frontal.TRIGGER_M, "lateral": lateral.TRIGGER_M,
+        "overtaking": -overtaking.TRIGGER_M,
     }
 )  # fmt: skip
-"""Where the robot is when an event triggers: metres before its place; `ped_crossing` at the edge of its crosswalk."""
+"""Where the robot is when an event triggers: metres before its place (negative: beyond it); `ped_crossing` at the edge
+of its crosswalk."""
 
 STILL_M: Final = 1e-6
 LATE_M: Final = 0.005
@@ -51,8 +53,8 @@ def sheet_of_run(folder: Path) -> pd.DataFrame:
 def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, ...]]:
     """The rows of an episode.
 
-    trigger_m: metres along the route from the robot to the event's place at the trigger. error_m: how much that is
-    less than stated. period_m: what the robot drove then in a tick, or came forward on its route (it may cut a
+    trigger_m: metres along the route from the robot to the event's place at the trigger. error_m: how far that is
+    from what is stated. period_m: what the robot drove then in a tick, or came forward on its route (it may cut a
     bend of it), the most that the error may be. speed_mps: median
     while walking (absent for who never walks); stated_mps: of the spec. left_m: how far left of the way's middle it
     stood or walked, most of the time. angle_deg: of its walk to the robot's heading at the trigger, -180 to 180.
@@ -72,7 +74,7 @@ def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, 
         for person in range(event.people):
             track = tracks[tracks[:, 2] == person]
             name = scenario.id if event.people == 1 else f"{scenario.id} {person + 1}"
-            told = (trigger_m, stated_m - trigger_m, period_m, *walked(event, track, log))
+            told = (trigger_m, abs(stated_m - trigger_m), period_m, *walked(event, track, log))
             rows.append((name, event.kind, *told[:4], event.speed_mps, *told[4:]))
     return rows
 
@@ -97,27 +99,37 @@ def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, 
     return float(np.median(far_m[moves]) / log.tick_s), where_m, math.degrees(angle), least_m
 
 
-def summary(sheet: pd.DataFrame) -> pd.DataFrame:
-    """One row per kind of event: episodes and people, ranges; later: triggers later than the motion of a tick."""
-    rows = []
-    for kind, part in sheet.groupby("kind", sort=True):
-        rows.append(
+def summary(sheet: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Two tables with a row per kind of event: its triggers, and how its people walked and stood; ranges.
+
+    off: triggers farther from what is stated than the robot's motion in a tick.
+    """
+    triggers, walks = [], []
+    stated: dict[str, str] = {kind: f"{metres:g}" for kind, metres in TRIGGERS_M.items()}
+    for kind, part in sheet.groupby("kind", sort=False):
+        triggers.append(
             {
                 "event": kind,
-                "episodes": part["scenario"].str.split().str[0].nunique(),
+                "n": part["scenario"].str.split().str[0].nunique(),
                 "people": len(part),
+                "stated": stated.get(str(kind), "entry"),
                 "trigger m": spread(part["trigger_m"]),
                 "error m": spread(part["error_m"]),
-                "a tick m": f"{part['period_m'].max():.3f}",
-                "later": str(int((part["error_m"] > part["period_m"] + LATE_M).sum())),
-                "speed m/s": spread(part["speed_mps"]),
+                "tick m": f"{part['period_m'].max():.3f}",
+                "off": str(int((part["error_m"] > part["period_m"] + LATE_M).sum())),
+            }
+        )
+        walks.append(
+            {
+                "event": kind,
+                "m/s": spread(part["speed_mps"]),
                 "stated m/s": spread(part["stated_mps"]),
                 "left m": spread(part["left_m"]),
-                "angle deg": spread(part["angle_deg"].abs(), 0),
+                "|angle| deg": spread(part["angle_deg"].abs(), 0),
                 "least m": spread(part["least_m"]),
             }
         )
-    return pd.DataFrame(rows)
+    return pd.DataFrame(triggers), pd.DataFrame(walks)
 
 
 def spread(values: pd.Series[float] | Sequence[float], digits: int = 2) -> str:
@@ -126,4 +138,4 @@ def spread(values: pd.Series[float] | Sequence[float], digits: int = 2) -> str:
     if not len(known):
         return "-"
     low, high = f"{known.min():.{digits}f}", f"{known.max():.{digits}f}"
-    return low if low == high else f"{low} to {high}"
+    return low if low == high else f"{low}..{high}"

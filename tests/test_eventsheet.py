@@ -70,8 +70,9 @@ def test_a_late_trigger_is_counted() -> None:
 
     late = ("t", "frontal", 19.5, 0.5, 0.1, 1.2, 1.2, 0.0, 180.0, 0.9)
     fine = ("u", "frontal", 19.95, 0.05, 0.1, 1.2, 1.2, 0.0, -180.0, 1.0)
-    table = summary(pd.DataFrame([late, fine], columns=list(COLUMNS)))
-    assert table["later"].tolist() == ["1"] and table["episodes"].tolist() == [2]
+    triggers, walks = summary(pd.DataFrame([late, fine], columns=list(COLUMNS)))
+    assert triggers["off"].tolist() == ["1"] and triggers["n"].tolist() == [2]
+    assert triggers["trigger m"].tolist() == ["19.50..19.95"] and walks["m/s"].tolist() == ["1.20"]
 
 
 @pytest.mark.engine

@@ -33,12 +33,13 @@ def ahead(within_m: float) -> Callable[[Event, EventQuery], float | None]:
     return trigger
 
 
-def behind(within_m: float) -> Callable[[Event, EventQuery], float | None]:
-    """Begins when the event's place is behind the robot, at most so far."""
+def behind(by_m: float) -> Callable[[Event, EventQuery], float | None]:
+    """Begins at the last tick at which the event's place is no farther behind the robot than this."""
 
     def trigger(event: Event, query: EventQuery) -> float | None:
         gap_m = event.route_s_m - query.route_s_m
-        return gap_m if -within_m <= gap_m < 0.0 else None
+        step_m = max(query.robot_v_mps, 0.0) * query.tick_ms / 1000
+        return gap_m if -by_m - step_m <= gap_m < step_m - by_m else None
 
     return trigger
 
