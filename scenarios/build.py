@@ -84,7 +84,7 @@ def reactive_candidates() -> Iterator[Candidates]:
 RECIPES: Mapping[str, Recipe] = MappingProxyType(
     {
         "long-horizon": Recipe(
-            version="0.1",
+            version="0.2",
             description="Start and goal more than 100 m apart in generated cities; one walkable path; street life.",
             expert="route",
             candidates=long_horizon_candidates,

@@ -25,6 +25,9 @@ STRIP_MIN_M = 30.0
 """Start and goal lie on sidewalks at least this long."""
 
 HALF_WIDTH_M = 0.32
+IN_GROUPS = 0.3
+"""Share of the walkers that walk in groups of two and three."""
+
 ON_ROAD_M = 2.0
 """So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the carriageway."""
 
@@ -84,7 +87,7 @@ def _draw(
         crossings=crossings,
         barriers=barriers,
         events=draw_events(street_map, route, way, rng),
-        crowd=CrowdSpec(),
+        crowd=CrowdSpec(groups=IN_GROUPS),
         time_limit_s=max(300.0, route.length_m / 0.2),
     )
 
