@@ -103,14 +103,15 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
     if len(set(kinds.values())) < 2:
         return
-    shown = Table("event", "n", *(head for _, head in BY_KIND), "95 % of SR", "invalid", "least m", box=box.SIMPLE_HEAD)
+    heads = ("event", "n", *(head for _, head in BY_KIND), "95 % of SR", "invalid", "least m")
+    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for kind in dict.fromkeys(kinds.values()):
         part = table[table["scenario"].map(kinds) == kind]
         values = {name: pd.to_numeric(part[name], errors="coerce").dropna() for name, _ in BY_KIND}
         low, high = interval_of(values["success"].to_numpy(dtype=float))
         nearest = pd.to_numeric(part["pedestrian_distance_min_m"], errors="coerce").min()
         means = (f"{values[name].mean():.2f}" if len(values[name]) else "-" for name, _ in BY_KIND)
-        interval = f"{low:.2f} to {high:.2f}" if len(values["success"]) else "-"
+        interval = f"{low:.2f}..{high:.2f}" if len(values["success"]) else "-"
         invalid = str((part["status"] == "invalid").sum())
         shown.add_row(kind, str(len(part)), *means, interval, invalid, "-" if pd.isna(nearest) else f"{nearest:.2f}")
     out.print(shown)

@@ -9,7 +9,7 @@ import pytest
 from shapely.geometry import box
 
 from cosim.geometry import Polyline, Pose
-from cosim.policies.social_force import DESIRED_MPS, RELAXATION_S, force, from_edge, from_people, seen
+from cosim.policies.social_force import BODIES_M, DESIRED_MPS, RELAXATION_S, force, from_edge, from_people, seen
 from cosim.ports import Privileged
 from cosim.state import NO_VEHICLES, NOBODY, People, RobotState
 
@@ -18,29 +18,31 @@ def walker(x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Peop
     return People.of(("c0",), [(x_m, y_m)], [heading_rad], [speed_mps], ("walk",))
 
 
-def potential(people: People, here: np.ndarray) -> float:
-    """V0 exp(-b / sigma) with the paper's b."""
-    away = here - people.xy[0]
-    step = 2.0 * people.speed[0] * np.array([math.cos(people.heading[0]), math.sin(people.heading[0])])
-    both = math.hypot(*away) + math.hypot(*(away - step))
-    return 2.1 * math.exp(-0.5 * math.sqrt(both**2 - float(step @ step)) / 0.3)
+def potential(people: People, d: np.ndarray, velocity: np.ndarray) -> float:
+    """A B exp(-b / B) with the paper's b, d (2,) metres from the person to the robot, between their outlines."""
+    heading = people.heading[0]
+    y = 0.5 * (people.speed[0] * np.array([math.cos(heading), math.sin(heading)]) - velocity)
+    both = math.hypot(*d) + math.hypot(*(d - y))
+    return 4.30 * 1.07 * math.exp(-0.5 * math.sqrt(both**2 - float(y @ y)) / 1.07)
 
 
-@pytest.mark.parametrize("here", [(0.0, 0.0), (1.5, 0.6), (2.2, -0.8)])
-def test_a_push_is_minus_the_slope_of_the_potential(here: tuple[float, float]) -> None:
+@pytest.mark.parametrize("d", [(-1.3, 0.0), (-0.8, 0.6), (-1.2, -0.8)])
+def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> None:
     """Differences of the potential over a thousandth of a metre agree with the push."""
-    person, at, h = walker(2.0, 0.3, 2.8, 1.3), np.array(here), 1e-3
+    person, at, velocity, h = walker(2.0, 0.3, 2.8, 1.3), np.array(d), np.array([1.0, 0.2]), 1e-3
     slope = [
-        (potential(person, at + h * axis) - potential(person, at - h * axis)) / (2 * h)
+        (potential(person, at + h * axis, velocity) - potential(person, at - h * axis, velocity)) / (2 * h)
         for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     ]
-    assert from_people(person, at)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
+    here = person.xy[0] + at * (1.0 + BODIES_M / math.hypot(*at))
+    assert from_people(person, here, velocity)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
 
 
-def test_what_happens_behind_counts_half() -> None:
-    """A push from ahead is felt whole, one from behind by half."""
-    pushes = np.array([[-1.0, 0.0], [1.0, 0.0]])
-    assert seen(pushes, np.array([1.0, 0.0])).tolist() == [[-1.0, 0.0], [0.5, 0.0]]
+def test_what_happens_behind_hardly_counts_and_pushes_lean_to_the_right() -> None:
+    """A push from ahead is felt whole, one from behind by 6 %; somebody straight ahead pushes a little to the right."""
+    ahead, behind = seen(np.array([[-1.0, 0.0], [1.0, 0.0]]), np.array([1.0, 0.0]))
+    assert np.hypot(*ahead) == pytest.approx(1.0) and np.hypot(*behind) == pytest.approx(0.06)
+    assert ahead[0] < -0.9 and -0.3 < ahead[1] < -0.2
 
 
 def scene(y_m: float, others: People = NOBODY) -> Privileged:

@@ -1,8 +1,14 @@
 """`social_force`: people and edges push the robot, its goal pulls it.
 
-Source: D. Helbing, P. Molnar, "Social force model for pedestrian dynamics", Physical Review E 51, 4282 (1995); its
-constants are named below. Its attractions by friends and shop windows are left out. Its walkers step sideways at will;
-this robot turns towards the velocity that the forces would give it.
+Sources: goal and edges after D. Helbing, P. Molnar, "Social force model for pedestrian dynamics", Physical Review E 51,
+4282 (1995), without its attractions by friends and shop windows; people after A. Johansson, D. Helbing, P. Shukla,
+"Specification of the social force pedestrian model by evolutionary adjustment to video tracking data", Advances in
+Complex Systems 10, 271 (2007), its second elliptical form, fitted to tracks of real people: the force of 1995 reaches
+so short that a robot that turns slowly drives into whoever stands. Constants are named below.
+
+Their people are points that step sideways at will and waver at random. Distances here are between the outlines of
+robot and person, the robot turns towards the velocity that the forces would give it, and where it meets somebody
+head-on it leans to the right.
 """
 
 from __future__ import annotations
@@ -16,26 +22,30 @@ import shapely
 from cosim.geometry import Floats, wrap_angle
 from cosim.policies.route import W_RADPS, crossing_limit
 from cosim.ports import Manifest, Observation, Privileged
-from cosim.state import Command, People
+from cosim.state import PERSON_RADIUS_M, Command, People
 
 DESIRED_MPS: Final = 1.34
 """The paper's mean desired speed."""
 RELAXATION_S: Final = 0.5
 """tau: how fast the desired velocity is taken up again."""
-PEOPLE_M2PS2: Final = 2.1
-PEOPLE_M: Final = 0.3
-"""V0 and sigma of the repulsive potential of people."""
-STEP_AHEAD_S: Final = 2.0
-"""Delta t: the space that somebody needs for the next step is so long."""
+PEOPLE_MPS2: Final = 4.30
+PEOPLE_M: Final = 1.07
+"""A and B of the repulsion by people."""
+STEP_AHEAD_S: Final = 0.5
+"""Delta t: the relative motion over this time stretches the ellipse."""
+BEHIND: Final = 0.06
+"""lambda: what is right behind counts for so much."""
+BODIES_M: Final = 0.36 + PERSON_RADIUS_M
+"""Between the middles of the robot and of a person that it touches with its front."""
+LEANS_RAD: Final = math.radians(15.0)
+"""A push is turned by so much, so that the robot passes on the right of whoever is straight ahead."""
 EDGES_M2PS2: Final = 10.0
 EDGES_M: Final = 0.2
 """U0 and R of the repulsive potential of edges."""
-HALF_VIEW_RAD: Final = math.radians(100.0)
-UNSEEN: Final = 0.5
-"""What happens behind counts for so much (c): outside an angle of 200 degrees."""
-
 ACTS_FOR_S: Final = 0.5
 """Forces change the velocity over this time to give the one that the robot turns to."""
+TOUCHING_M: Final = 0.05
+"""Outlines are never nearer than this for the force, which would grow beyond all bounds."""
 LOOK_M: Final = 2.0
 GAIN_PER_S: Final = 2.0
 NEAR_M: Final = 8.0
@@ -44,7 +54,7 @@ NEAR_M: Final = 8.0
 class SocialForce:
     """Pushed by people and edges, pulled along its route (Helbing and Molnar 1995); knows what no camera sees."""
 
-    manifest = Manifest("social_force", version="1", rate_hz=10.0, camera=None, privileged=True)
+    manifest = Manifest("social_force", version="2", rate_hz=10.0, camera=None, privileged=True)
 
     def reset(self, scenario_id: str, seed: int) -> None:
         """Nothing to forget."""
@@ -69,33 +79,40 @@ def force(known: Privileged, velocity: Floats) -> Floats:
     ahead = known.route.at(min(known.route_s_m + LOOK_M, known.route.length_m)).xy - here
     direction = ahead / max(math.hypot(*ahead), 1e-9)
     pull = (DESIRED_MPS * direction - velocity) / RELAXATION_S
-    total: Floats = pull + seen(from_people(known.people, here), direction).sum(axis=0) + from_edge(known, here)
+    pushes = seen(from_people(known.people, here, velocity), direction)
+    total: Floats = pull + pushes.sum(axis=0) + from_edge(known, here)
     return total
 
 
-def from_people(people: People, here: Floats) -> Floats:
-    """(N, 2) m/s2: the push of each person.
+def from_people(people: People, here: Floats, velocity: Floats) -> Floats:
+    """(N, 2) m/s2: the push of each person on a robot at `here` (2,) that drives at `velocity` (2,).
 
-    The potential V0 exp(-b / sigma) falls with the semi-minor axis b of the ellipse whose foci are the person and
-    where the next step leads it; 2 b = sqrt((|r| + |r - s|)^2 - |s|^2), s the step. The push is minus the gradient.
+    d: from the person to the robot, between their outlines; y: how the person moves relative to the robot in Delta t;
+    2 b = sqrt((|d| + |d - y|)^2 - |y|^2): the push is A exp(-b / B) (|d| + |d - y|) / 2 b along the mean of the
+    directions of d and d - y.
     """
     away = here - people.xy
-    step = STEP_AHEAD_S * people.speed[:, None] * np.column_stack([np.cos(people.heading), np.sin(people.heading)])
+    r = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
+    away = away * (np.maximum(r - BODIES_M, TOUCHING_M) / r)[:, None]
+    going = people.speed[:, None] * np.column_stack([np.cos(people.heading), np.sin(people.heading)])
+    step = STEP_AHEAD_S * (going - velocity)
     from_step = away - step
-    r, q = np.hypot(away[:, 0], away[:, 1]), np.hypot(from_step[:, 0], from_step[:, 1])
-    both = r + q
-    b = 0.5 * np.sqrt(np.maximum(both**2 - (step**2).sum(axis=1), 1e-6))
-    slope = both / (4.0 * b)
-    outward = away / np.maximum(r, 1e-9)[:, None] + from_step / np.maximum(q, 1e-9)[:, None]
-    strength = PEOPLE_M2PS2 / PEOPLE_M * np.exp(-b / PEOPLE_M) * slope * (r < NEAR_M)
-    pushes: Floats = strength[:, None] * outward
+    near, then = np.hypot(away[:, 0], away[:, 1]), np.maximum(np.hypot(from_step[:, 0], from_step[:, 1]), 1e-9)
+    both = near + then
+    b = 0.5 * np.sqrt(np.maximum(both**2 - (step**2).sum(axis=1), (2 * TOUCHING_M) ** 2))
+    along = 0.5 * (away / near[:, None] + from_step / then[:, None])
+    strength = PEOPLE_MPS2 * np.exp(-b / PEOPLE_M) * both / (2.0 * b) * (r < NEAR_M)
+    pushes: Floats = strength[:, None] * along
     return pushes
 
 
 def seen(pushes: Floats, direction: Floats) -> Floats:
-    """Pushes (N, 2), weaker for what happens outside the view; w(e, f) of the paper."""
-    ahead = -pushes @ direction >= np.hypot(pushes[:, 0], pushes[:, 1]) * math.cos(HALF_VIEW_RAD)
-    weighed: Floats = pushes * np.where(ahead, 1.0, UNSEEN)[:, None]
+    """Pushes (N, 2), turned by LEANS_RAD and weaker for what is not ahead: w = lambda + (1 - lambda) (1 + cos) / 2."""
+    strength = np.maximum(np.hypot(pushes[:, 0], pushes[:, 1]), 1e-9)
+    ahead = -pushes @ direction / strength
+    cos, sin = math.cos(LEANS_RAD), math.sin(LEANS_RAD)
+    weight = BEHIND + (1.0 - BEHIND) * 0.5 * (1.0 + ahead)
+    weighed: Floats = pushes * weight[:, None] @ np.array([[cos, sin], [-sin, cos]])
     return weighed
 
 
