@@ -6,13 +6,12 @@ import math
 from collections.abc import Sequence
 from typing import Any, Final, Literal
 
-import pybullet as p
-
 from cosim.errors import EngineError
 from cosim.geometry import Floats, Pose
 from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M, RobotState
 from physics.buildings import Building, Wall
+from physics.bullet import p
 from physics.furniture import Prop, solids_of
 from physics.materials import friction
 from physics.mesh import Mesh, as_lists, join

@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-import pybullet as p
 from numpy.typing import NDArray
 
 from cosim.errors import EngineError
 from cosim.geometry import Floats
 from cosim.state import LABELS
+from physics.bullet import p
 from physics.mesh import Mesh, as_lists
 
 Colour = tuple[float, float, float]

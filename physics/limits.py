@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import pybullet as p
+from physics.bullet import p
 
 Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
 

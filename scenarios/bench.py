@@ -8,7 +8,6 @@ is the limit. Shares and ratios hold when the machine is slow; times do not.
 from __future__ import annotations
 
 import multiprocessing
-import os
 import resource
 import statistics
 import tempfile
@@ -234,14 +233,8 @@ def measure(rounds: int, tell: Callable[[str], None]) -> Report:
 
 def alone(work: Callable[[Any], Any], size: float) -> Any:
     """Run `work(size)` in a fresh process."""
-    with multiprocessing.get_context("spawn").Pool(1, initializer=_quiet) as pool:
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
         return pool.apply(work, (size,))
-
-
-def _quiet() -> None:
-    """Engines greet on stdout when they are imported; the table stands there."""
-    with Path(os.devnull).open("wb") as nowhere:
-        os.dup2(nowhere.fileno(), 1)
 
 
 def spread(values: Sequence[float]) -> tuple[str, str]:
