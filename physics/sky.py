@@ -29,6 +29,10 @@ SKY_SIZE: Final = (256, 512)
 """Rows and columns of a procedural sky."""
 TURBIDITY: Final = 3.0
 GROUND_ALBEDO: Final = 0.2
+HOUSES: Final = 0.4
+"""What houses and trees hide of the sky over a street, weighed by the cosine: a street 1.5 times as wide as its houses
+are high. A photographed sky has its own."""
+HOUSE_ALBEDO: Final = 0.4
 
 _FULL_KLX: Final = 128.0
 _CLEAR_M: Final = 30_000.0
@@ -138,12 +142,19 @@ def _assembled(light: Light, sun: Floats, beam: Floats, sky: Floats, lamps: floa
     bright = float((up + beam * max(float(sun[2]), 0.0) + 0.5 * horizon) @ LUMINANCE)
     exposure = _KEY * 2.0**light.exposure_ev * max(bright, 1e-5) ** -_ADAPTED
     glare = _disc(ways, sun, beam)
-    ambient = np.stack([up, side, ground])
+    over = up if light.hdri else (1.0 - HOUSES) * up + HOUSES * HOUSE_ALBEDO * (side + _on_walls(sun, beam))
+    ambient = np.stack([over, side, ground])
     whole += np.where(above, glare, 0.0).astype(np.float32)
     for array in (sun, beam, ambient, whole, horizon):
         array.flags.writeable = False
     shadows = light.shadows and float(beam @ LUMINANCE) > 0.02
     return Sky(sun, beam, ambient, whole, horizon, fog_per_m, exposure, lamps, shadows)
+
+
+def _on_walls(sun: Floats, beam: Floats) -> Floats:
+    """(3,) what the sun gives a wall, on the mean over all ways that walls face."""
+    up = max(float(sun[2]), 0.0)
+    return np.asarray(beam * math.sqrt(max(1.0 - up * up, 0.0)) / math.pi) if up > 0.0 else np.zeros(3)
 
 
 def _horizon(sky: Floats, row: int) -> Floats:

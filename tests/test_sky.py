@@ -96,6 +96,14 @@ def test_daylight_falls_as_it_does() -> None:
     assert sky_of(Light(hour=0.0)).lamps == 1.0 and sky_of(Light(hour=12.0)).lamps == 0.0
 
 
+def test_shade_in_a_street_is_lit_by_the_houses_too() -> None:
+    """At noon ground in the shade is bluish, not blue, and three to eight times darker than in the sun."""
+    sky = sky_of(Light(hour=12.0))
+    shade = sky.ambient[0]
+    assert 1.2 < shade[2] / shade[0] < 2.0
+    assert 3.0 < luminance(shade + sky.sun_colour * sky.sun[2]) / luminance(shade) < 8.0
+
+
 def test_dusk_is_red_where_the_sun_is_and_blue_above() -> None:
     """Half an hour after sunset the western horizon is redder than the zenith, and the sun gives no light."""
     sky = sky_of(Light(hour=20.1, cloud_cover=0.0))
