@@ -301,7 +301,7 @@ class Board:
 
     def tell(self, message: object) -> None:
         """Take in what a worker says."""
-        from scenarios.messages import Done, Waits
+        from scenarios.messages import Compares, Done, Waits
         from scenarios.messages import Progress as Report
 
         if isinstance(message, Report):
@@ -312,6 +312,10 @@ class Board:
                 self._tasks[message.scenario] = task
             note = f"m  {message.time_s:.0f} s simulated, {message.failures} failures"
             self.bars.update(task, completed=round(message.route_s_m), note=note)
+        elif isinstance(message, Compares):
+            if message.scenario in self._tasks:
+                note = f"m  the street without the robot: {100.0 * message.share:.0f} %"
+                self.bars.update(self._tasks[message.scenario], note=note)
         elif isinstance(message, Waits):
             err.print(f"{message.scenario}: {message.reason}", soft_wrap=True, highlight=False, markup=False)
         elif isinstance(message, Done):

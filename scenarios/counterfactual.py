@@ -6,7 +6,8 @@ the same moments, the same event pedestrians and guests are where they were, but
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Final, NamedTuple
 
 from cosim.clock import Clock
 from cosim.delay import Delay, Tracks, delay_of
@@ -18,6 +19,14 @@ from cosim.step import Step
 from scenarios.assemble import place
 from sumo_nets.again import StreetAgain
 from sumo_nets.entrances import Entrances
+
+TELL_EVERY_TICKS: Final = 20
+Tell = Callable[[float], None]
+"""Takes in which share of the street without the robot has been simulated."""
+
+
+def untold(share: float) -> None:
+    """Nobody wants to know."""
 
 
 class Compared(NamedTuple):
@@ -49,12 +58,14 @@ class Beside:
         self._present[0].add(step.street_after.people)
         self._present[1].add(step.street_after.vehicles)
 
-    def compared(self, scenario: Scenario, entrances: Entrances) -> Compared:
+    def compared(self, scenario: Scenario, entrances: Entrances, tell: Tell = untold) -> Compared:
         """entrances: of the episode. No SUMO may be running in this process."""
         net_path, street_map = place(scenario.place)
         absent = Tracks("c"), Tracks("v")
         with StreetAgain(net_path, street_map, scenario, entrances) as crowd:
-            for robot, reply in self._moments:
+            for tick, (robot, reply) in enumerate(self._moments):
+                if tick % TELL_EVERY_TICKS == 0:
+                    tell(tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
                 absent[0].add(street.people)
                 absent[1].add(street.vehicles)

@@ -45,6 +45,13 @@ class Waits(msgspec.Struct, frozen=True, tag=True):
     reason: str
 
 
+class Compares(msgspec.Struct, frozen=True, tag=True):
+    """The episode is over and its street is simulated without the robot: which share of it."""
+
+    scenario: str
+    share: float
+
+
 class Done(msgspec.Struct, frozen=True, tag=True):
     """The episode is over and its record is on disk."""
 
@@ -59,7 +66,7 @@ class Unsaved(msgspec.Struct, frozen=True, tag=True):
     reason: str
 
 
-Message = Progress | Waits | Done | Unsaved
+Message = Progress | Waits | Compares | Done | Unsaved
 
 encode = msgspec.msgpack.Encoder().encode
 decode_job = msgspec.msgpack.Decoder(Job).decode

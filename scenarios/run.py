@@ -23,7 +23,7 @@ from cosim.step import Step
 from cosim.witness import Witness, unwitnessed
 from physics.cameras import CameraChoice
 from scenarios.assemble import Stage, staged
-from scenarios.counterfactual import Beside
+from scenarios.counterfactual import Beside, Tell, untold
 from scenarios.directing import Direct, directed
 from scenarios.on_air import OnAir
 
@@ -50,11 +50,12 @@ def episode(
     live: Live | None = None,
     direct: Direct = directed,
     counterfactual: bool = False,
+    comparing: Tell = untold,
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
 
     live: where it is on the air meanwhile. direct: gives the director of its event pedestrians. counterfactual: whether
-    it is compared with its street without the robot.
+    it is compared with its street without the robot; comparing: is told how far that has come.
     """
     began = time.perf_counter()
     record = begun(scenario, policy.manifest, suite_hash)
@@ -74,7 +75,7 @@ def episode(
         return Outcome(replaced(record, status="crashed", reason=reason), None, traceback.format_exc())
     if counterfactual:
         try:
-            measures = record.measures | beside.compared(scenario, stage.entrances).measures
+            measures = record.measures | beside.compared(scenario, stage.entrances, comparing).measures
             record = replaced(record, measures=measures)
         except CosimError as error:
             trouble = traceback.format_exc()

@@ -21,7 +21,7 @@ from cosim.clock import Clock
 from cosim.policies.load import load_policy
 from cosim.referee import Verdict
 from cosim.step import Step
-from scenarios.messages import Done, Job, Message, Progress, Unsaved, Waits, decode_job, encode
+from scenarios.messages import Compares, Done, Job, Message, Progress, Unsaved, Waits, decode_job, encode
 
 if TYPE_CHECKING:
     from scenarios.directing import Direct
@@ -59,6 +59,7 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
             live=job.live,
             direct=director_of(job, pipe),
             counterfactual=job.counterfactual,
+            comparing=partial(comparing, job, pipe),
         )
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
@@ -82,6 +83,11 @@ def director_of(job: Job, pipe: Connection) -> Direct:
     if job.outside is None:
         return directed
     return partial(directed_by, job.outside, lambda reason: send(pipe, Waits(job.scenario.id, reason)))
+
+
+def comparing(job: Job, pipe: Connection, share: float) -> None:
+    """Reports how much of the street without the robot is simulated."""
+    send(pipe, Compares(job.scenario.id, share))
 
 
 def watcher(job: Job, pipe: Connection) -> Watch:

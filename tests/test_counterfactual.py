@@ -15,12 +15,15 @@ from cosim.events import EventReply
 from cosim.geometry import Pose
 from cosim.policies.load import load_policy
 from cosim.record import Record
+from cosim.runfolder import RunFolder, RunSpec
 from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from cosim.state import RobotState, Street
 from cosim.streetmap import Port
 from cosim.walks import WalkGraph
 from scenarios.assemble import place
 from scenarios.crossings import build_all
+from scenarios.messages import Compares, Done, Message, Progress
+from scenarios.pool import run_all
 from scenarios.run import episode
 from sumo_nets.again import StreetAgain
 from sumo_nets.crowd import SumoCrowd
@@ -112,3 +115,25 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, t
     assert {n: v for n, v in asked.measures.items() if n not in names} == plain.measures
     assert row["people_compared"] == asked.measures["people_compared"] and row["people_compared"] > 0
     assert not set(names) & set(plain.measures)
+
+
+def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_path: Path) -> None:
+    """Between the last progress of an episode of five seconds and its end it tells five times how far it is."""
+    short = Suite(name="s", version="1", scenarios=(msgspec.structs.replace(scenario, time_limit_s=5.0),))
+    manifest = load_policy("stop").manifest
+    spec = RunSpec(
+        suite="s",
+        suite_version="1",
+        suite_hash=short.content_hash,
+        policy="stop",
+        policy_name=manifest.name,
+        policy_version=manifest.version,
+        scenarios=(scenario.id,),
+        versions={},
+        counterfactual=True,
+    )
+    told: list[Message] = []
+    with RunFolder.create(tmp_path / "run", spec, short) as folder:
+        run_all(folder, short.scenarios, "stop", manifest, jobs=1, tell=told.append)
+    assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
+    assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
