@@ -112,12 +112,14 @@ def _check(reply: EventReply, query: EventQuery) -> None:
     people = [event.people for event in query.events]
     if [len(state.walkers) for state in reply.states] != people:
         raise EngineError(f"it answered with {len(reply.states)} states for {len(people)} events, or with other people")
-    known = {f"{e.id}-{i}" if i else e.id for e in query.events for i in range(e.people)}
+    known = {name for event in query.events for name in event.names}
     shown = {actor.id for actor in reply.actors}
     if len(shown) < len(reply.actors) or not shown <= known:
         raise EngineError(f"it showed people of no event, or twice: {', '.join(sorted(shown - known)[:5])}")
     walkers = [walker for state in reply.states for walker in state.walkers]
     told = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
-    told += sum(abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) for a in reply.actors)
+    told += sum(
+        abs(a.x_m) + abs(a.y_m) + abs(a.heading_rad) + abs(a.speed_mps) + abs(a.pace_mps or 0.0) for a in reply.actors
+    )
     if not math.isfinite(told):
         raise EngineError("it answered with a place, heading or speed that is no number")

@@ -20,7 +20,7 @@ def bystanders(people: People, events: Iterable[Event]) -> tuple[Bystander, ...]
     first, last = bisect_left(people.ids, "e"), bisect_left(people.ids, "f")
     if first == last:
         return ()
-    own = {f"{event.id}-{k}" if k else event.id for event in events for k in range(event.people)}
+    own = {name for event in events for name in event.names}
     gap = people.xy[:, None] - people.xy[None, first:last]
     near = ((gap * gap).sum(axis=2) < NEAR_M * NEAR_M).any(axis=1)
     rows = [i for i in np.flatnonzero(near).tolist() if people.ids[i] not in own]

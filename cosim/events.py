@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Literal
+from typing import Final, Literal
 
 import msgspec
 
@@ -24,6 +24,10 @@ GROUPS: Mapping[Kind, tuple[int, int]] = MappingProxyType(
     }
 )  # fmt: skip
 """How many people each kind of event may have."""
+
+
+GUEST: Final = "ei-"
+"""What the ids of injected pedestrians begin with."""
 
 
 class Event(msgspec.Struct, frozen=True, kw_only=True):
@@ -51,6 +55,8 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
     def __post_init__(self) -> None:
         if not self.id.startswith("e"):
             raise SpecError(f"event id '{self.id}': ids of event pedestrians start with 'e'")
+        if self.id.startswith(GUEST):
+            raise SpecError(f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians")
         if not 0.0 < self.speed_mps <= 3.0:
             raise SpecError(f"event '{self.id}': speed_mps must be in (0, 3], not {self.speed_mps}")
         if not self.half_width_m > 0.3:
@@ -61,6 +67,11 @@ class Event(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"event '{self.id}': people of '{self.kind}' must be {allowed}, not {self.people}")
         if (self.kind == "ped_crossing") != (self.half_length_m > 0.0):
             raise SpecError(f"event '{self.id}': half_length_m is the crosswalk's: of 'ped_crossing', and of no other")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The ids of its people: its own, and with "-1", "-2" for the further ones."""
+        return (self.id, *(f"{self.id}-{k}" for k in range(1, self.people)))
 
 
 class Walker(msgspec.Struct, frozen=True, kw_only=True):
@@ -94,7 +105,11 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
     """A pedestrian of ours as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones; a
-    guest's starts with "ei-", a resident's with "n"."""
+    guest's starts with "ei-", a resident's with "n".
+
+    speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who turns or rises on
+    the spot treads.
+    """
 
     id: str
     x_m: float
@@ -102,6 +117,7 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
     heading_rad: float
     speed_mps: float
     doing: Doing
+    pace_mps: float | None = None
 
 
 class Bystander(msgspec.Struct, frozen=True, array_like=True):

@@ -82,7 +82,8 @@ class Strides:
     _table: Floats = field(default_factory=lambda: np.zeros((1, 5)))
 
     def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats) -> tuple[Floats, Floats]:
-        """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their speeds (N,).
+        """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their speeds (N,), or the
+        paces that those show who tread on the spot.
 
         Who is new begins somewhere in a stride, drawn from the name, at the pace of the moment.
         """

@@ -83,12 +83,12 @@ def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.
     return rounded
 
 
-def touches(xy: Floats, body: Body) -> bool:
-    """Whether the disk of a person at (2,) metres meets the robot's outline."""
+def touches(xy: Floats, body: Body, within_m: float = TOUCH_M) -> bool:
+    """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
     local = (np.asarray(xy) - body.pose.xy)[None] @ np.array([[cos, -sin], [sin, cos]])
     half = np.array(body.half_m)
-    return bool(_gap(local, -half, half)[0] <= TOUCH_M)
+    return bool(_gap(local, -half, half)[0] <= within_m)
 
 
 def _gap(points: Floats, low: Floats, high: Floats) -> Floats:

@@ -210,8 +210,9 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
                 raise SpecError(f"scenario '{self.id}': {field} {(x, y)} is not the route's end {end}")
         if not self.goal_radius_m > 0 or not self.time_limit_s > 0:
             raise SpecError(f"scenario '{self.id}': goal_radius_m and time_limit_s must be positive")
-        if len({event.id for event in self.events}) != len(self.events):
-            raise SpecError(f"scenario '{self.id}': two events share an id")
+        names = [name for event in self.events for name in event.names]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise SpecError(f"scenario '{self.id}': two events have a pedestrian '{twice[0]}': give one another id")
 
     @property
     def start_pose(self) -> Pose:

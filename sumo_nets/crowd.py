@@ -236,13 +236,14 @@ class SumoCrowd(Crowd):
         names = (*ids, *(a.id for a in cast))
         places = np.concatenate([xy, others])
         speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
+        paces = np.concatenate([speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]])
         return People.of(
             names,
             places,
             np.concatenate([heading, [a.heading_rad for a in cast]]),
             speeds,
             (*("walk" if fast else "stand" for fast in (speed > STANDING_MPS).tolist()), *(a.doing for a in cast)),
-            *self._strides.update(names, places, speeds),
+            *self._strides.update(names, places, paces),
         )
 
     def _vehicles(self, vehicles: dict[str, Row]) -> Vehicles:

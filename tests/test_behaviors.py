@@ -150,6 +150,8 @@ def test_an_event_that_makes_no_sense_is_refused() -> None:
         event("ped_crossing", half_length_m=0.0)
     with pytest.raises(SpecError, match="ids of event pedestrians start with 'e'"):
         event("frontal", id="x1")
+    with pytest.raises(SpecError, match="'ei-' begins the ids of injected pedestrians"):
+        event("frontal", id="ei-anna")
 
 
 def test_a_frontal_pedestrian_does_not_push_the_robot() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import subprocess
@@ -64,6 +65,25 @@ def test_a_guest_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> N
     gone = min(tick for tick, actors in seen.items() if not actors)
     assert gone == pytest.approx(43 + 20, abs=1)
     assert one.log == (Injected(tick=3, injection=anna(doing="look")),)
+
+
+def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
+    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path ends only."""
+    one = guests(Injected(tick=0, injection=anna(doing="sit")))
+    shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
+    assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
+    assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {"sit"}
+
+
+@pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
+def test_a_guest_whose_end_the_robot_stands_on_stays_beside_it(off_m: tuple[float, float]) -> None:
+    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot for ever."""
+    end = (90.0 + off_m[0], 90.0 + off_m[1])
+    one = guests(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
+    shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
+    assert len(shown) < 240
+    assert {(actor.speed_mps, actor.doing) for actor in shown[-38:]} == {(0.0, "stand")}
+    assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
 
 
 def test_the_log_alone_replays_the_guests() -> None:

@@ -15,7 +15,7 @@ from shapely.geometry import LineString, Point, Polygon, box
 from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.errors import SpecError, UsageError
-from cosim.events import EventQuery
+from cosim.events import Event, EventQuery
 from cosim.geometry import Polyline
 from cosim.loop import query
 from cosim.policies import POLICIES
@@ -295,3 +295,15 @@ def test_the_walking_graph_agrees_with_the_branches() -> None:
     reach = graph.reach(Port("west", 1), closed)
     assert {p.strip for p in reach.ports if np.isfinite(reach.to(p))} == {"west", "east"}
     assert all(a != b for a, b in itertools.combinations(closed, 2))
+
+
+def test_two_pedestrians_of_one_name_are_refused() -> None:
+    """The second of a group "e0" is "e0-1": no other event may be called so."""
+    one = suite("reactive").scenarios[0]
+    two = [
+        Event(id=name, kind="queueing", x_m=0, y_m=0, heading_rad=0, route_s_m=5, half_width_m=2, people=2)
+        for name in ("e0", "e0-1")
+    ]
+    assert len(msgspec.structs.replace(one, events=(two[0],)).events[0].names) == 2
+    with pytest.raises(SpecError, match="two events have a pedestrian 'e0-1': give one another id"):
+        Scenario(**msgspec.structs.asdict(one) | {"events": tuple(two)})

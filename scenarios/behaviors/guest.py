@@ -1,6 +1,7 @@
 """A guest: an injected pedestrian that walks its path, stays at the end for its time, and is gone.
 
-It goes round people and the robot; a point of its path at which somebody is counts as reached beside it.
+It goes round people and the robot; a point of its path at which somebody or the robot stands counts as reached beside
+it.
 """
 
 from __future__ import annotations
@@ -9,11 +10,13 @@ import math
 from typing import NamedTuple
 
 import msgspec
+import numpy as np
 
-from cosim.events import Actor, EventQuery, Walker
+from cosim.events import GUEST, Actor, EventQuery, Walker
+from cosim.giveway import KEEP_M, touches
 from cosim.injection import Injected, Injection
-from scenarios.behaviors.sight import sight_of_guest, taken
-from scenarios.behaviors.walking import turned, walked_to
+from scenarios.behaviors.sight import BESIDE_M, STILL_MPS, sight_of_guest, taken
+from scenarios.behaviors.walking import robot_of, turned, walked_to
 
 
 class Guest(NamedTuple):
@@ -49,7 +52,7 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
     goal = injection.path[guest.leg]
     sight = sight_of_guest(shown_id(injection), query)
     after = walked_to(walker, *goal, injection.speed_mps, sight)
-    reached = (after.x_m, after.y_m) == goal or taken(walker, goal, sight)
+    reached = (after.x_m, after.y_m) == goal or taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
     vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))
     after = msgspec.structs.replace(after, vx_mps=vx_mps, vy_mps=vy_mps)
     moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
@@ -58,19 +61,26 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
     return guest._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
 
 
+def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
+    """Whether the robot stands where nobody can reach a point then, and the walker has come up to it."""
+    near = math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M
+    return near and abs(query.robot_v_mps) < STILL_MPS and touches(np.array(goal), robot_of(query), KEEP_M)
+
+
 def shown_id(injection: Injection) -> str:
     """The id under which the world shows a guest."""
-    return f"ei-{injection.id}"
+    return f"{GUEST}{injection.id}"
 
 
 def actor_of(guest: Guest, tick_ms: int) -> Actor:
-    """The guest as the world shows it."""
+    """The guest as the world shows it; who is held up on the way stands."""
     walker = guest.walker
+    still = "stand" if guest.arrived_tick is None else guest.injection.doing
     return Actor(
         id=shown_id(guest.injection),
         x_m=walker.x_m,
         y_m=walker.y_m,
         heading_rad=walker.heading_rad,
         speed_mps=guest.moved_m * 1000 / tick_ms,
-        doing=guest.injection.doing if guest.moved_m < 1e-6 else "walk",
+        doing=still if guest.moved_m < 1e-6 else "walk",
     )

@@ -92,11 +92,11 @@ def _timed(before: EventState, after: EventState, query: EventQuery) -> EventSta
 
 def _shown(event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:
     actors = []
-    for number, (old, new) in enumerate(zip(before.walkers, after.walkers, strict=True)):
+    for number, (name, old, new) in enumerate(zip(event.names, before.walkers, after.walkers, strict=True)):
         moved_m = math.hypot(new.x_m - old.x_m, new.y_m - old.y_m)
         actors.append(
             Actor(
-                id=event.id if number == 0 else f"{event.id}-{number}",
+                id=name,
                 x_m=new.x_m,
                 y_m=new.y_m,
                 heading_rad=new.heading_rad,

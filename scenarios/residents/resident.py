@@ -52,6 +52,7 @@ class Resident(NamedTuple):
     """Where a resident stands. way: the nodes still to walk to, the last is the goal; goal: where it goes or is.
 
     doing: what it does there. since_tick: when it faced what it does; None before. choices: how many it made.
+    moving_mps: velocity of its last step; shown_mps: what its body shows, more where it treads on the spot.
     """
 
     number: int
@@ -83,7 +84,8 @@ def actor_of(resident: Resident) -> Actor:
         x_m=resident.x_m,
         y_m=resident.y_m,
         heading_rad=resident.heading_rad,
-        speed_mps=resident.shown_mps,
+        speed_mps=math.hypot(*resident.moving_mps),
+        pace_mps=resident.shown_mps,
         doing=resident.doing if here else "walk" if resident.shown_mps > 0.0 else "stand",
     )
 
@@ -169,8 +171,8 @@ def _turned(resident: Resident, graph: BehaviorGraph, query: EventQuery) -> Resi
     wanted = resident.heading_rad if spot is None else spot.heading_rad
     heading = turned(resident.heading_rad, wanted, query.tick_ms / 1000)
     if abs(wrap_angle(heading - wanted)) > _FACES_RAD:
-        return resident._replace(heading_rad=heading, shown_mps=TREADS_MPS)
-    return resident._replace(heading_rad=wanted, shown_mps=0.0, since_tick=query.tick)
+        return resident._replace(heading_rad=heading, moving_mps=(0.0, 0.0), shown_mps=TREADS_MPS)
+    return resident._replace(heading_rad=wanted, moving_mps=(0.0, 0.0), shown_mps=0.0, since_tick=query.tick)
 
 
 def _walked(resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]) -> Resident:
@@ -182,7 +184,7 @@ def _walked(resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbo
     x, y = graph.points[way[0]]
     far_m = math.dist(at, (x, y))
     if len(way) == 1 and far_m < max(ARRIVES_M, 0.5 * resident.shown_mps * tick_s):
-        return arrived(resident, graph)
+        return arrived(resident, graph)._replace(moving_mps=((x - at[0]) / tick_s, (y - at[1]) / tick_s))
     pace = resident.speed_mps if len(way) > 1 else min(resident.speed_mps, max(0.35, far_m / 0.5))
     pace = min(pace, far_m / tick_s)
     wanted = (pace * (x - at[0]) / max(far_m, 1e-9), pace * (y - at[1]) / max(far_m, 1e-9))
