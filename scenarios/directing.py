@@ -8,12 +8,14 @@ temporary folder, with no port and nobody else in it. `cosim direct` serves any 
 from __future__ import annotations
 
 import ast
+import fcntl
 import hashlib
 import importlib.util
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -30,6 +32,10 @@ Direct = Callable[[str], AbstractContextManager[Director]]
 """Gives the director of an episode, by the episode's name."""
 
 RETRY_S: Final = 0.2
+LEFT_S: Final = 60.0
+"""A folder that is younger may be one that an episode is only beginning to use."""
+_FOLDER: Final = "cosim-zenoh-"
+_SOCKET: Final = "hub.sock"
 _OURS: Final = ("cosim.", "scenarios.")
 
 
@@ -37,8 +43,9 @@ _OURS: Final = ("cosim.", "scenarios.")
 def directed(episode: str) -> Iterator[Director]:
     """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
     with ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cosim-zenoh-"))
-        endpoint = f"unixsock-stream/{folder}/hub.sock"
+        _sweep(Path(tempfile.gettempdir()))
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=_FOLDER))
+        endpoint = f"unixsock-stream/{folder}/{_SOCKET}"
         key = keys.director("local", keys.chunk(episode))
         serve_director(stack.enter_context(Session.hub(endpoint)), key, react)
         yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
@@ -93,6 +100,16 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
         for other in imported:
             if other.startswith(_OURS):
                 _gather(other, found)
+
+
+def _sweep(temporary: Path) -> None:
+    """Remove the folders of episodes that were killed: nobody holds the lock that Zenoh lays beside a socket."""
+    for lock in temporary.glob(f"{_FOLDER}*/{_SOCKET}.lock"):
+        with suppress(OSError):  # another user's, held, or gone meanwhile
+            if time.time() - lock.parent.stat().st_mtime > LEFT_S:
+                with lock.open("r+b") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(lock.parent)
 
 
 def _reached(outside: Outside, waiting: Waiting) -> Session:

@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -18,6 +19,7 @@ from cosim.control import Command
 from cosim.ports import Manifest, Observation
 from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from cosim.walks import WalkGraph
+from scenarios.directing import directed
 
 pytestmark = pytest.mark.engine
 
@@ -231,3 +233,42 @@ def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> No
     ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
     assert {"scenarios.behaviors.frontal", "cosim.events"} < ours <= set(sources("scenarios.behaviors"))
     assert len(behaviours()) == 16 and behaviours() == behaviours()
+
+
+HELD = """
+import sys, time
+from scenarios.directing import directed
+with directed(sys.argv[1]):
+    print("here", flush=True)
+    time.sleep(60.0)
+"""
+
+
+def test_the_folder_of_an_episode_that_was_killed_goes_when_the_next_one_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once it is old enough; not that of an episode that runs, and nothing else."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    lasting = tmp_path / "cosim-zenoh-notes"
+    lasting.mkdir()
+    folders: list[Path] = []
+    processes: list[subprocess.Popen[str]] = []
+    try:
+        for name in ("killed", "running"):
+            words, environment = [sys.executable, "-c", HELD, name], ENVIRONMENT | {"TMPDIR": str(tmp_path)}
+            processes.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment))
+            assert processes[-1].stdout is not None and processes[-1].stdout.readline() == "here\n"
+            folders += {*tmp_path.glob("cosim-zenoh-*")} - {lasting, *folders}
+        killed, running = folders
+        processes[0].kill()
+        processes[0].wait()
+        with directed("young"):
+            assert killed.is_dir()
+        for folder in folders:
+            os.utime(folder, (0.0, 0.0))
+        with directed("next"):
+            assert not killed.exists() and (running / "hub.sock").exists() and lasting.is_dir()
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
