@@ -197,7 +197,7 @@ def test_who_does_something_faces_it_and_leaves_the_middle_free() -> None:
                 assert ahead.intersects(roads)
             assert min(at.distance(line) for line in middles) > CLEAR_HALF_M + PERSON_RADIUS_M - 1e-6
             assert at.distance(walk) < OFF_WALK_M + 0.01
-    assert {"bench", "window"} <= seen
+    assert seen == {"bench", "window", "stop"}
 
 
 def test_where_no_shelter_stands_nobody_waits_for_a_bus() -> None:

@@ -147,6 +147,23 @@ def test_a_guest_goes_round_people_and_ends_beside_who_stands_at_its_end() -> No
     assert actor_of(guest, TICK_MS).speed_mps == 0.0
 
 
+@pytest.mark.parametrize("names", ["ab", "ba", "abc"])
+def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None:
+    """With the same path they are not in each other after a second, nor ever again before they arrive."""
+    path = ((0.0, 5.0), (10.0, 5.0))
+    guests = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
+    for tick in range(120):
+        seen = tuple(
+            Bystander(f"ei-{g.injection.id}", g.walker.x_m, g.walker.y_m, g.walker.vx_mps, g.walker.vy_mps)
+            for g in guests
+        )
+        after = [advanced(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
+        guests = [guest for guest in after if guest is not None]
+        places = [(g.walker.x_m, g.walker.y_m) for g in guests]
+        gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
+        assert len(guests) == len(names) and (tick < 20 or min(gaps) > 0.4)
+
+
 def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
     """Of a crowd, one 3 m from an event pedestrian and a guest beside it; nobody while there is no event pedestrian."""
     ids = ("c0", "c1", "e0", "e0-1", "ei-anna")

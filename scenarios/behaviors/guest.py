@@ -50,7 +50,7 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
             walker = msgspec.structs.replace(walker, heading_rad=heading)
         return guest._replace(walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0)
     goal = injection.path[guest.leg]
-    sight = sight_of_guest(shown_id(injection), query)
+    sight = sight_of_guest(shown_id(injection), walker, query)
     after = walked_to(walker, *goal, injection.speed_mps, sight)
     reached = (after.x_m, after.y_m) == goal or taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
     vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
+import msgspec
+
 from cosim.events import Bystander, Event, EventQuery, Walker
 from cosim.orca import HalfPlane
 from cosim.state import PERSON_RADIUS_M
@@ -24,6 +26,9 @@ SQUEEZES_S = 3.0
 PRESSES_S = 6.0
 """Who insists on a place and is not there after the first time squeezes through; after the second the crowd gives
 way."""
+
+SAME_M = 0.001
+"""Who is nearer is in the same place."""
 
 SHARED = 0.5
 """Of the avoidance between two who steer the same way."""
@@ -58,10 +63,21 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
     return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else LEAST_M)
 
 
-def sight_of_guest(name: str, query: EventQuery) -> Sight:
+def sight_of_guest(name: str, guest: Walker, query: EventQuery) -> Sight:
     """The sight of the guest that is shown under this id."""
     walkers = [walker for state in query.states if state.phase != "gone" for walker in state.walkers]
-    return Sight(query, [*map(fellow, walkers), *met(one for one in query.bystanders if one.id != name)])
+    others = (_told_apart(name, guest, one) for one in query.bystanders if one.id != name)
+    return Sight(query, [*map(fellow, walkers), *met(others)])
+
+
+def _told_apart(name: str, guest: Walker, other: Bystander) -> Bystander:
+    """Who is in the very same place, as two are who are injected there at once, is seen a little to one side: else they
+    would walk in each other for ever."""
+    if math.hypot(other.x_m - guest.x_m, other.y_m - guest.y_m) > SAME_M:
+        return other
+    left_m = SAME_M if name < other.id else -SAME_M
+    cos, sin = math.cos(guest.heading_rad), math.sin(guest.heading_rad)
+    return msgspec.structs.replace(other, x_m=guest.x_m - left_m * sin, y_m=guest.y_m + left_m * cos)
 
 
 def fellow(walker: Walker) -> Neighbour:
