@@ -50,7 +50,8 @@ class Tally:
     """Counts of one place. `counts`: seconds of pairs, seconds of persons, numbers of entries, by name.
 
     things: what cannot be walked through, as (kind, ground). crossings: ids of the signalised ones that were entered.
-    at_red: who and what went at red, when and where, in words.
+    at_red: who and what went at red, when and where, in words. A light that is red when it comes into view has been red
+    at least since then; who is on its crossing at that moment has not entered it.
     """
 
     def __init__(
@@ -65,6 +66,7 @@ class Tally:
         self._tick = -1
         self._since: dict[str, int] = {}
         self._red_s: dict[str, float] = {}
+        self._new: set[str] = set()
         self._on: set[str] = set()
         self._over: set[tuple[str, str]] = set()
         self._boxes: dict[str, tuple[Floats, Floats]] = {}
@@ -74,8 +76,11 @@ class Tally:
         people = street.people
         self._since = {name: self._since.get(name, street.tick) for name in people.ids}
         self._pairs(street.tick, people)
-        for crossing, signal in street.signals.items():
-            self._red_s[crossing] = 0.0 if signal.walk else self._red_s.get(crossing, -np.inf) + self._tick_s
+        self._new = street.signals.keys() - self._red_s.keys()
+        self._red_s = {
+            crossing: 0.0 if signal.walk else self._red_s.get(crossing, 0.0) + self._tick_s
+            for crossing, signal in street.signals.items()
+        }
         if street.tick % EVERY_TICKS == 0 and len(people):
             self._penetrations(people, street.vehicles)
         self._signals(street)
@@ -166,7 +171,8 @@ class Tally:
             for i in np.flatnonzero(inside).tolist():
                 name = people.ids[i]
                 # Crossings of one junction may overlap: who walks on one of them does not enter another.
-                if name not in now and name not in self._on and street.tick > self._since[name]:
+                begins = name not in now and name not in self._on and street.tick > self._since[name]
+                if begins and crossing not in self._new:
                     self._entered(name, crossing, self._red_s[crossing], street.tick)
                 now.add(name)
             if looks and signal.walk and len(vehicles):

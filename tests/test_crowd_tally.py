@@ -48,6 +48,27 @@ def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
     assert tally.crossings == {":j_c0"}
 
 
+def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
+    """Entries at red count before any green was seen, and when the light was out of view; a red from before that is
+    forgotten; who stands on a crossing that comes into view does not enter it."""
+
+    def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
+        """How many entered, entered at red, and entered within a second of red."""
+        tally = Tally(MAP, 0.05, [])
+        for tick, (x_m, walk) in enumerate(zip(xs, walks, strict=True)):
+            seen = street(tick, [(x_m, 0.0)], walk=bool(walk))
+            tally.see(replace(seen, signals=MappingProxyType({})) if walk is None else seen)
+        kinds = "signalised crossings", "at red", "within a second of red"
+        return [tally.counts[f"persons entered {kind}"] for kind in kinds]
+
+    comes = [-4.0 + 0.1 * k for k in range(60)]
+    waits = [-4.0] * 100
+    assert counted(comes, [False] * 60) == [1, 1, 0]
+    assert counted(waits + comes, [True] * 50 + [None] * 50 + [False] * 60) == [1, 1, 0]
+    assert counted(waits + comes, [True] * 10 + [False] * 40 + [None] * 90 + [False] * 20) == [1, 0, 1]
+    assert counted([4.0] * 60, [None] * 20 + [False] * 40) == [0, 0, 0]
+
+
 def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> None:
     """A slanting crossing, red all the time, is walked through by somebody who entered the other one at green."""
     slanting = Strip(
