@@ -58,7 +58,7 @@ def bench_crowd(cities: int, minutes: float, residents: int, groups: float, elde
         table.add_row(name, f"{counts[name]:.2f}", "", "", "")
     out.print(table)
     out.print("People and pairs are counted in seconds, entries and vehicles one by one.")
-    each = Table("city", "min", "persons", "overlaps, share of pair-seconds", "crowd's step, ms")
+    each = Table("city", "min", "persons", "overlaps, share of pair-seconds", "crowd's step, CPU ms")
     for one in found:
         overlaps = one.counts.get("overlaps", 0.0) / max(one.counts.get("pairs in contact range", 0.0), 1e-9)
         each.add_row(

@@ -52,7 +52,7 @@ GROUPS_EVERY_TICKS = 10
 class Watched(msgspec.Struct, frozen=True, kw_only=True):
     """What was seen in one city. counts: see `Tally`. crossings: signalised ones that somebody entered.
 
-    crowd_ms: wall milliseconds of a step of the crowd, on the mean. group_gaps_m: every half second, of each group, how
+    crowd_ms: CPU milliseconds of a step of the crowd, on the mean. group_gaps_m: every half second, of each group, how
     far its loneliest member is from its nearest fellow.
     """
 
@@ -126,7 +126,7 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
 def drive(
     scenario: Scenario, street_map: StreetMap, limit_ticks: int, gaps_m: list[float]
 ) -> tuple[Tally, int, int, float]:
-    """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's wall seconds.
+    """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's CPU seconds.
 
     gaps_m: takes up the gaps within groups.
     """
@@ -176,7 +176,7 @@ def drive(
 
 
 class Stopwatch:
-    """A crowd whose steps are timed."""
+    """A crowd whose steps are timed, in seconds of CPU: what else runs on the machine does not count."""
 
     def __init__(self, crowd: SumoCrowd) -> None:
         self._crowd = crowd
