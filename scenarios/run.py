@@ -70,19 +70,23 @@ def episode(
                 if live is not None:
                     watches.append(air.enter_context(OnAir(live, scenario, stage.guests)).tell)
                 record, log = drive(record, scenario, stage, *watches)
-    except Exception as error:  # noqa: BLE001  the one place where a failing episode is turned into its record
-        reason = str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
-        return Outcome(replaced(record, status="crashed", reason=reason), None, traceback.format_exc())
+    except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
+        return Outcome(replaced(record, status="crashed", reason=in_words(error)), None, traceback.format_exc())
     if counterfactual:
         try:
             measures = record.measures | beside.compared(scenario, stage.entrances, comparing).measures
             record = replaced(record, measures=measures)
-        except CosimError as error:
+        except Exception as error:  # noqa: BLE001  the episode itself is over and sound
             trouble = traceback.format_exc()
-            record = replaced(record, reason=f"the street without the robot: {error}")
+            record = replaced(record, reason=f"the street without the robot: {in_words(error)}")
     wall_s = time.perf_counter() - began
     clock = {"wall_s": wall_s, "setup_s": first_tick_s}
     return Outcome(replaced(record, clock=clock), log, trouble)
+
+
+def in_words(error: Exception) -> str:
+    """What a record says of an error: its message, with its type unless the project raised it on purpose."""
+    return str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
 
 
 def drive(record: Record, scenario: Scenario, stage: Stage, *watches: Watch) -> tuple[Record, Log]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import NoReturn
 
 import msgspec
 import pandas as pd
@@ -137,3 +138,17 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
         run_all(folder, short.scenarios, "stop", manifest, jobs=1, tell=told.append)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
+
+
+def test_an_episode_outlives_its_comparison(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever goes wrong in the street without the robot: the episode is done, and the record says what it was."""
+
+    def fails(*_: object) -> NoReturn:
+        raise KeyError("v7")
+
+    monkeypatch.setattr("scenarios.run.Beside.compared", fails)
+    short = msgspec.structs.replace(scenario, time_limit_s=1.0)
+    outcome = episode(short, load_policy("stop"), counterfactual=True)
+    assert outcome.record.status == "done" and outcome.log is not None and "fails" in outcome.traceback
+    assert outcome.record.reason == "the street without the robot: KeyError: 'v7'"
+    assert "people_delay_s" not in outcome.record.measures
