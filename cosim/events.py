@@ -30,7 +30,7 @@ GUEST: Final = "ei-"
 """What the ids of injected pedestrians begin with."""
 
 
-class Event(msgspec.Struct, frozen=True, kw_only=True):
+class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One event: a pedestrian or a group on the way.
 
     x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along

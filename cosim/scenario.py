@@ -6,12 +6,14 @@ A spec is complete: the same spec gives the same episode, bit for bit, in any pr
 from __future__ import annotations
 
 import hashlib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any, Literal
 
 import msgspec
+from msgspec import inspect as info
 
 from cosim.errors import SpecError
 from cosim.events import Event
@@ -19,9 +21,10 @@ from cosim.geometry import Polyline, Pose
 
 SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
+_FOLDER_NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]{0,99}")
 
 
-class _Uneven(msgspec.Struct, frozen=True, kw_only=True):
+class _Uneven(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A place whose ground may be uneven. roughness: from 0 (flat) to 1; a spec of flat ground does not mention it,
     so that it keeps the hash it had before there was uneven ground."""
 
@@ -67,7 +70,7 @@ class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
 Place = City | CityMap
 
 
-class Barrier(msgspec.Struct, frozen=True, kw_only=True):
+class Barrier(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A fence across a way. heading_rad: along the way it closes; length_m: across it.
 
     strip, end: the port of the walking graph that it closes.
@@ -83,7 +86,7 @@ class Barrier(msgspec.Struct, frozen=True, kw_only=True):
     height_m: float = 1.0
 
 
-class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True):
+class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
 
     id: str
@@ -98,7 +101,7 @@ MOST_PER_1000_M2 = 150.0
 MOST_RESIDENTS = 60
 
 
-class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
+class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """The street life around the robot: persons and vehicles kept within radius_m of it.
 
     density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
@@ -148,7 +151,7 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True):
             )
 
 
-class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
+class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
     """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
 
     hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
@@ -178,7 +181,7 @@ class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True):
             raise SpecError(f"light hdri must be a Radiance .hdr file, not '{self.hdri}'")
 
 
-class Scenario(msgspec.Struct, frozen=True, kw_only=True):
+class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
 
     id: str
@@ -201,6 +204,8 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
     schema: int = SCHEMA
 
     def __post_init__(self) -> None:
+        if not _FOLDER_NAME.fullmatch(self.id):
+            raise SpecError(f"scenario id '{self.id}' cannot name a folder: no '/', no '.' in front, 1 to 100 letters")
         if self.schema != SCHEMA:
             raise SpecError(f"scenario '{self.id}' has schema {self.schema}; this version reads {SCHEMA}")
         if len(self.route) < 2:
@@ -223,7 +228,7 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True):
         return Polyline(self.route)
 
 
-class Suite(msgspec.Struct, frozen=True, kw_only=True):
+class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """A named, versioned list of scenarios."""
 
     name: str
@@ -269,13 +274,36 @@ def _canonical(spec: msgspec.Struct) -> bytes:
 
 
 def read_suite(path: Path) -> Suite:
-    """The suite in a JSON file. Raises SpecError naming the file and the field."""
+    """The suite in a JSON file. Raises SpecError naming the file and the field, and what may stand there."""
     try:
-        return msgspec.json.decode(path.read_bytes(), type=Suite)
+        suite = msgspec.json.decode(path.read_bytes(), type=Suite)
     except OSError as error:
         raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, SpecError) as error:
-        raise SpecError(f"{path}: {error}") from error
+        raise SpecError(f"{path}: {error}{_choices(str(error))}") from error
+    if not suite.scenarios:
+        raise SpecError(f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more")
+    return suite
+
+
+def _choices(refusal: str) -> str:
+    """What msgspec does not say when it refuses a field or a name: the valid ones."""
+    found = re.fullmatch(r"(Object contains unknown field|Invalid enum value) .*?( - at `(.*)`)?", refusal)
+    if found is None:
+        return ""
+    here: Any = info.type_info(Suite)
+    for step in re.findall(r"\.(\w+)|(\[)", found[3] or ""):
+        here = _below(here, *step)
+    kinds = getattr(here, "types", (here,))
+    valid = getattr(here, "values", ()) or [f.encode_name for kind in kinds for f in getattr(kind, "fields", ())]
+    return f". Valid choices: {', '.join(dict.fromkeys(map(str, valid)))}" if valid else ""
+
+
+def _below(here: Any, field: str, item: str) -> Any:
+    """The msgspec type of a field of a struct, or of the items of a tuple."""
+    if item:
+        return getattr(here, "item_type", None)
+    return next((f.type for f in getattr(here, "fields", ()) if f.encode_name == field), None)
 
 
 def write_suite(suite: Suite, path: Path) -> None:
