@@ -14,7 +14,7 @@ from cosim.clock import Clock
 from cosim.metrics import COUNTERFACTUAL, METRICS
 from cosim.record import Record
 from cosim.results import interval_of, summary_of
-from cosim.scenario import Scenario, read_suite
+from cosim.scenario import Scenario, Suite, read_suite
 
 SHOWN = (
     ("success", "SR"),
@@ -31,9 +31,10 @@ BY_KIND = (("success", "SR"), ("collisions", "C"), ("out_of_lane", "OL"), ("free
 
 
 def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
-    """The table of a run: a row per episode, then the means with their intervals."""
+    """The table of a run: a row per episode, then the means with their intervals. Made for 80 columns."""
+    numbers = (Column(head, no_wrap=True, justify="right") for head in (*(head for _, head in SHOWN), "C/OL/F"))
     shown = Table(
-        Column("episode", no_wrap=True), "ended", *(head for _, head in SHOWN), "count C/OL/F", box=box.SIMPLE_HEAD
+        Column("episode", no_wrap=True), Column("ended", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0
     )
     for _, row in table.iterrows():
         counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
@@ -53,6 +54,17 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
     for _, row in pd.concat([crashed, invalid]).iterrows():
         out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_scenarios(out: Console, suite: Suite) -> None:
+    """A row per scenario of a suite: made for 80 columns."""
+    heads = ("scenario", "place", "route\nm", "cross-\nings", "events", "bar-\nriers", "limit\ns")
+    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=0)
+    for s in suite.scenarios:
+        events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
+        numbers = (f"{s.route_line.length_m:.0f}", str(len(s.crossings)), events, str(len(s.barriers)))
+        shown.add_row(s.id, s.place.name, *numbers, f"{s.time_limit_s:.0f}")
+    out.print(shown)
 
 
 def print_delays(out: Console, table: pd.DataFrame) -> None:

@@ -13,6 +13,10 @@ CosimError                what a user can mend: shown as one message, exit code 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from difflib import get_close_matches
+
+MOST_LISTED = 30
+"""Of more valid choices than these, five are listed: those most like what was asked for, else the first."""
 
 
 class CosimError(Exception):
@@ -48,6 +52,10 @@ class RunError(CosimError):
 
 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
-    """The error for a `name` that is none of the `choices`: unknown("suite", "x", ["unit"])."""
-    valid = ", ".join(sorted(choices)) or "none"
-    return UsageError(f"unknown {what} '{name}'. Valid choices: {valid}.")
+    """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x", ["unit"])."""
+    valid = sorted(choices)
+    if len(valid) > MOST_LISTED:
+        near = get_close_matches(name, valid, n=5, cutoff=0.5)
+        listed = ", ".join(sorted(near) or valid[:5])
+        return UsageError(f"unknown {what} '{name}'. Valid choices: {len(valid)}, among them {listed}.")
+    return UsageError(f"unknown {what} '{name}'. Valid choices: {', '.join(valid) or 'none'}.")
