@@ -84,6 +84,7 @@ class RunFolder:
         found = read_spec(path)
         same = (
             "suite",
+            "suite_version",
             "suite_hash",
             "policy",
             "policy_version",
@@ -95,6 +96,9 @@ class RunFolder:
         for field in same:
             mine, theirs = getattr(spec, field), getattr(found, field)
             if mine != theirs:
+                if isinstance(mine, dict) and isinstance(theirs, dict):
+                    changed = {name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name)}
+                    mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
                 raise RunError(
                     f"{path} is of another run: its {field} is {_brief(theirs)}, now asked for is {_brief(mine)}. "
                     "Resume with the same command, or choose another --out."

@@ -68,6 +68,8 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
     """Write the film of a finished episode. Raises RunError when there is none, or when the replay differs."""
     told = recorded(folder, scenario_id)
     scenario, record, log = told
+    if not cut.from_s < cut.to_s:
+        raise RunError(f"nothing lies between --from {cut.from_s:g} s and --to {cut.to_s:g} s: give a later --to")
     last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
     if not 0.0 <= cut.from_s < Clock().time_s(last):
         raise RunError(

@@ -10,6 +10,7 @@ from cosim.policies.replay import Replay
 from cosim.record import Log, Record, begun
 from cosim.runfolder import read_records
 from cosim.scenario import Scenario, read_suite
+from cosim.versions import versions
 from scenarios.assemble import staged
 from scenarios.counterfactual import Beside, Compared
 from scenarios.run import Watch, drive
@@ -60,7 +61,15 @@ def check(folder: Path, told: Recorded, state_hash: str) -> None:
     """Raises RunError when a replay came out otherwise than recorded."""
     record = told.record
     if state_hash != record.state_hash:
+        here = versions()
+        changed = [
+            f"{name} {record.versions.get(name)}, here {here[name]}"
+            for name in here
+            if here[name] != record.versions.get(name)
+        ]
+        why = f"made with other versions: {'; '.join(changed)}" if changed else "of the same versions: of other code"
         raise RunError(
             f"{folder}: '{record.scenario}' was not the same when it was replayed ({state_hash[:16]}, recorded "
-            f"{record.state_hash[:16]}): other versions? It was made with {record.versions}"
+            f"{record.state_hash[:16]}). The record is {why}, or it was changed. Replay it with the code that made it, "
+            "or run it again."
         )

@@ -100,6 +100,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
     finally:
         path.write_bytes(kept)
     assert done.returncode == 1 and "not the same when it was replayed" in done.stderr
+    assert "of the same versions: of other code" in done.stderr
     assert not list(desk.glob("wrong*"))
 
 
@@ -108,6 +109,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
     [
         (("film", "run", "t-9"), "unknown finished episode"),
         (("film", "run", "t-0", "--from", "99"), "nothing to film"),
+        (("film", "run", "t-0", "--from", "1", "--to", "nan"), "give a later --to"),
         (("film", "run", "t-0", "--size", "wide"), "--size 'wide'"),
         (("film", "run", "t-0", "--size", "321x181"), "both sides must be even"),
         (("film", "run", "t-0", "--size", "64x64"), "nothing can be read"),

@@ -70,7 +70,13 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("policy", "q"), ("suite_hash", "0"), ("versions", {"numpy": "1"}), ("counterfactual", True)],
+    [
+        ("policy", "q"),
+        ("suite_version", "2-groups0.4"),
+        ("suite_hash", "0"),
+        ("versions", {"numpy": "1"}),
+        ("counterfactual", True),
+    ],
 )
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
     """Another policy, suite or version would mix two runs: the difference is named."""
