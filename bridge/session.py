@@ -7,6 +7,7 @@ with its error instead of silence.
 from __future__ import annotations
 
 import json
+import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -18,6 +19,9 @@ import zenoh
 from cosim.errors import EngineError
 
 Handler = Callable[[bytes], bytes]
+
+_SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
+"""In zenoh's errors: where it was built, of no use to anybody here."""
 
 _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
@@ -53,12 +57,14 @@ class Session:
     @classmethod
     def hub(cls, listen: str) -> Session:
         """The centre of a star: listens at an endpoint such as `unixsock-stream//tmp/a.sock`."""
-        return cls(_open(_config("router", [listen], []), f"cannot listen at {listen}"))
+        remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
+        return cls(_open("router", [listen], [], f"cannot listen at {listen}", remedy))
 
     @classmethod
     def client(cls, connect: str) -> Session:
         """A session that connects to a hub; it opens no port of its own."""
-        return cls(_open(_config("client", [], [connect]), f"no hub answers at {connect}"))
+        remedy = "Is a process started that listens there, and is the endpoint the same?"
+        return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy))
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
@@ -141,8 +147,8 @@ class Session:
         self.close()
 
 
-def _open(config: zenoh.Config, failure: str) -> zenoh.Session:
+def _open(mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str) -> zenoh.Session:
     try:
-        return zenoh.open(config)
+        return zenoh.open(_config(mode, listen, connect))
     except zenoh.ZError as error:
-        raise EngineError(f"Zenoh: {failure} ({error})") from error
+        raise EngineError(f"Zenoh: {failure} ({_SOURCE_LINE.sub('', str(error)).rstrip('.')}). {remedy}") from error

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import shlex
 import signal
 import sys
-from contextlib import nullcontext
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated
@@ -21,7 +22,6 @@ from rich.progress import (
     TimeElapsedColumn,
     TimeRemainingColumn,
 )
-from rich.table import Table
 
 from cosim.cli_bench import bench
 from cosim.cli_city import city_app
@@ -29,7 +29,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_on
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
-from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
+from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_scenarios, print_sheet, print_table
 from cosim.errors import CosimError, UsageError
 
 app = typer.Typer(
@@ -158,14 +158,16 @@ def run(
     if director is not None:
         endpoint = checked_endpoint(director, "--director")
         outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
-    held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
-    with held, nullcontext() if on_air is None else Session.hub(on_air.endpoint):
+    with ExitStack() as stack:
+        if on_air is not None:
+            stack.enter_context(Session.hub(on_air.endpoint))
+        held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
+        stack.enter_context(held)
         done = held.finished()
         todo = [s for s in picked if s.id not in done]
         if done:
             err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
         board = Board(len(picked), len(done), {s.id: s.route_line.length_m for s in picked})
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
         try:
             with board.bars:
                 tell = board.tell
@@ -183,8 +185,8 @@ def run(
                 )
         except KeyboardInterrupt:
             finished = len(held.finished())
-            again = " ".join(a for a in sys.argv[1:] if a != "--resume")
-            again += "" if folder else f" --out {path}"
+            again = shlex.join(a for a in sys.argv[1:] if a != "--resume")
+            again += "" if folder else f" --out {shlex.quote(str(path))}"
             err.print(f"Stopped. {finished} of {len(picked)} episodes are finished and kept in {path}.")
             err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
             raise typer.Exit(130) from None
@@ -214,12 +216,7 @@ def list_all(
         for name, make in POLICIES.items():
             out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
         return
-    table = Table("scenario", "place", "route m", "crossings", "events", "barriers", "time limit s")
-    for s in shipped(suite).scenarios:
-        events = s.events[0].kind if len(s.events) == 1 else len(s.events)
-        cells = (f"{s.route_line.length_m:.0f}", len(s.crossings), events, len(s.barriers), s.time_limit_s)
-        table.add_row(s.id, s.place.name, *(f"{c:g}" if isinstance(c, float) else str(c) for c in cells))
-    out.print(table)
+    print_scenarios(out, shipped(suite))
 
 
 @app.command(
@@ -327,7 +324,8 @@ class Board:
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is left."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
     except UsageError as error:

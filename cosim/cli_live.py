@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from pathlib import Path
@@ -36,7 +35,7 @@ def inject(
     from bridge.session import Session
 
     payload = _payload(message)
-    with Session.client(connect) as session:
+    with Session.client(checked_endpoint(connect, "--connect")) as session:
         below = _chosen(session, env)
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
@@ -49,7 +48,7 @@ def listen(
     topic: Annotated[str, typer.Argument(help="clock, robot, crowd, signals or events.")] = "events",
     connect: Connect = DEFAULT,
     env: Env = None,
-    seconds: Annotated[float | None, typer.Option(min=0.0, help="How long; by default until stopped.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")] = None,
 ) -> None:
     """Print what a running episode tells: a line of JSON each time. For `events` what happened before comes first."""
     from bridge.session import Session
@@ -57,7 +56,7 @@ def listen(
     topics = ("clock", "robot", "crowd", "signals", "events")
     if topic not in topics:
         raise unknown("topic", topic, topics)
-    with Session.client(connect) as session:
+    with Session.client(checked_endpoint(connect, "--connect")) as session:
         below = _chosen(session, env)
         if topic == "events":
             print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
@@ -79,7 +78,6 @@ def direct(
     from bridge.session import Session
     from scenarios.directing import behaviours, serve
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with Session.hub(checked_endpoint(listen, "--listen")) as session:
         serve(session)
         print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
@@ -136,6 +134,7 @@ def _chosen(session: object, env: str | None) -> str:
 
 def checked_endpoint(endpoint: str, option: str) -> str:
     """An endpoint of an option, as zenoh writes it. Raises UsageError."""
+    like = DEFAULT if option in ("--live", "--connect") else DIRECTOR
     if not endpoint.startswith(("tcp/", "unixsock-stream/", "tls/", "udp/", "quic/")):
-        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS, like {DEFAULT}")
+        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS, like {like}")
     return endpoint

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import pandas as pd
@@ -297,6 +298,12 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, who
         ({"time_limit_s": "long"}, "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`"),
         ({"crowd": {"persons": -1}}, "persons and vehicles cannot be negative"),
         ({"schema": 99}, "has schema 99"),
+        (
+            {"crowd": {"gruops": 0.4}},
+            "unknown field `gruops` - at `$.scenarios[0].crowd`. Valid choices: persons, radius",
+        ),
+        ({"ends_at": "noon"}, "Invalid enum value 'noon' - at `$.scenarios[0].ends_at`. Valid choices: goal, stop"),
+        ({"id": "../../elsewhere"}, "scenario id '../../elsewhere' cannot name a folder"),
     ],
 )
 def test_a_broken_suite_file_is_named_with_its_field(desk: Path, change: dict[str, object], message: str) -> None:
@@ -307,6 +314,36 @@ def test_a_broken_suite_file_is_named_with_its_field(desk: Path, change: dict[st
     said = cosim("run", "bad.json", "--out", "bad", cwd=desk)
     assert said.returncode == 1 and "bad.json" in said.stderr and message in said.stderr
     assert not (desk / "bad").exists()
+
+
+def test_a_suite_without_scenarios_is_refused(desk: Path) -> None:
+    """Nothing to run is an error that names the file, not a run of nothing that went well."""
+    suite = json.loads((desk / "tiny.json").read_text())
+    (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
+    said = cosim("run", "empty.json", "--out", "empty", cwd=desk)
+    assert said.returncode == 1 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
+
+
+def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path) -> None:
+    """A wrong endpoint is told with the remedy, and the same command with a right one is not refused."""
+    said = cosim("run", "tiny.json", "--live", "tcp/127.0.0.1:99999", "--out", "air", cwd=desk)
+    assert said.returncode == 1 and not (desk / "air").exists()
+    assert "cannot listen at tcp/127.0.0.1:99999 (invalid port value). Choose" in said.stderr
+    heard = cosim("listen", "--connect", "7447", cwd=desk)
+    assert heard.returncode == 2 and "--connect '7447': write it as PROTOCOL/ADDRESS" in heard.stderr
+
+
+def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped before any command has begun: exit code 130."""
+    from cosim.__main__ import main
+
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "cosim.cli", SimpleNamespace(main=stopped))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
 
 
 def test_a_suite_of_another_city_is_refused(desk: Path) -> None:
