@@ -126,7 +126,10 @@ def _chosen(session: object, env: str | None) -> str:
             raise unknown("running episode", env, names)
         return names[env]
     if not names:
-        raise EngineError("no episode is running there: start one with `cosim run ... --live ENDPOINT`")
+        raise EngineError(
+            "no episode is running there: start one with `cosim run ... --live ENDPOINT`; one just started takes some "
+            "seconds to be on the air"
+        )
     if len(names) > 1:
         raise UsageError(f"several episodes are running: choose one with --env: {', '.join(names)}")
     return found[0]
