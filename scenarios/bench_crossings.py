@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import cache
 
 import msgspec
 import numpy as np
@@ -65,14 +66,9 @@ def cross_all(crossings: int, cities: int, policy: str, jobs: int, tell: Callabl
     found: list[Crossed] = []
 
     def one(seed: int, count: int) -> None:
-        context = multiprocessing.get_context("spawn")
-        try:
-            with ProcessPoolExecutor(1, context, initializer=quiet, initargs=(os.getpid(),)) as alone:
-                found.extend(alone.submit(cross_city, City(seed=seed, size_m=SIZE_M), count, policy).result())
-        except BrokenProcessPool:
-            lost = Crossed(scenario="", city=f"city {seed}", crossing="", ended="crashed", reason="the process died")
-            found.extend([lost] * count)
-        tell(f"{len(found)} of {crossings} crossings")
+        for crossed in cross_city(City(seed=seed, size_m=SIZE_M), count, policy):
+            found.append(crossed)
+            tell(f"{len(found)} of {crossings} crossings")
 
     with ThreadPoolExecutor(jobs) as pool:
         try:
@@ -84,21 +80,42 @@ def cross_all(crossings: int, cities: int, policy: str, jobs: int, tell: Callabl
     return sorted(found, key=lambda crossed: (crossed.city, crossed.scenario))
 
 
+def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
+    """Drive over so many crossings of one city, one after another, in a process of its own."""
+    context = multiprocessing.get_context("spawn")
+    names, done = [""] * count, 0
+    try:
+        with ProcessPoolExecutor(1, context, initializer=quiet, initargs=(os.getpid(),)) as alone:
+            scenarios = alone.submit(drawn, city, count).result()
+            names = [scenario.id for scenario in scenarios]
+            for scenario in scenarios:
+                yield alone.submit(cross, scenario, policy).result()
+                done += 1
+    except BrokenProcessPool:
+        for name in names[done:]:
+            yield Crossed(scenario=name, city=city.name, crossing="", ended="crashed", reason="the process died")
+
+
 def quiet(parent: int) -> None:
     """Tie this process to its parent, and keep the engines' greetings off its table."""
     die_with(parent)
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
-def cross_city(city: City, count: int, policy: str) -> list[Crossed]:
-    """Drive over so many crossings of one city, one after another."""
+def drawn(city: City, count: int) -> list[Scenario]:
+    """So many crossings of a city."""
     _, street_map = place(city)
-    driver = load_policy(policy)
-    return [cross(scenario, driver) for scenario in build_all(city, street_map, WalkGraph(street_map), 0, count)]
+    return build_all(city, street_map, WalkGraph(street_map), 0, count)
 
 
-def cross(scenario: Scenario, driver: Policy) -> Crossed:
-    """Drive over one crossing and count what happens around it."""
+@cache
+def driver_of(policy: str) -> Policy:
+    """The policy of this process: the same one for all its crossings."""
+    return load_policy(policy)
+
+
+def cross(scenario: Scenario, policy: str) -> Crossed:
+    """Drive over one crossing and count what happens around it. A policy that raised is made anew for the next."""
     _, street_map = place(scenario.place)
     tally, lines = Tally(street_map, Clock().tick_s), StopLines(Clock().tick_s)
 
@@ -106,7 +123,9 @@ def cross(scenario: Scenario, driver: Policy) -> Crossed:
         tally.see(step.street_after)
         tally.drove(lines.passed(step.street_after.vehicles.ids))
 
-    outcome = episode(scenario, driver, watch=watch)
+    outcome = episode(scenario, driver_of(policy), watch=watch)
+    if outcome.traceback:
+        driver_of.cache_clear()
     return told(scenario, outcome, tally)
 
 

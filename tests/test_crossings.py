@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -70,6 +71,46 @@ def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red() -> None:
     rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", done.stdout)}
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
     assert int(re.findall(r"(\d+) vehicles passed stop lines", done.stdout)[0]) > 0
+
+
+DIES = """
+import os
+from cosim.ports import Manifest
+
+class Dies:
+    manifest = Manifest("dies", rate_hz=10.0, camera=None, privileged=True)
+    before = []
+
+    def __init__(self):
+        self.raised = False
+
+    def reset(self, scenario_id, seed):
+        self.before.append(scenario_id)
+
+    def act(self, observation):
+        if len(self.before) == 2 and not self.raised:
+            os._exit(3)
+        self.raised = True
+        raise ValueError("no idea")
+"""
+
+
+def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path) -> None:
+    """A policy raises at its first crossing; made anew, it ends the process at the second: both rows say which."""
+    (tmp_path / "dies.py").write_text(DIES)
+    words = ["bench", "crossings", "--crossings", "2", "--cities", "1", "--policy", "dies:Dies"]
+    done = subprocess.run(
+        [sys.executable, "-m", "cosim", *words],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+        check=False,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    assert done.returncode == 0, done.stderr
+    (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", done.stdout)
+    assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
 
 
 class Heedless:
