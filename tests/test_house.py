@@ -20,7 +20,7 @@ def test_every_top_level_name_is_ours() -> None:
     owners = packages_distributions()
     for room in ROOMS:
         assert set(owners.get(room, ["sidewalk-cosim"])) == {"sidewalk-cosim"}
-    assert [e.value for e in entry_points(group="console_scripts", name="cosim")] == ["cosim.cli:main"]
+    assert [e.value for e in entry_points(group="console_scripts", name="cosim")] == ["cosim.__main__:main"]
 
 
 def test_the_ground_floor_imports_no_engine() -> None:
