@@ -50,33 +50,41 @@ def kept_apart(
     if not len(one):
         return wanted
     start, goal = _points(before), _points(wanted)
-    at = goal.copy()
     share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
-    share_other = np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
+    shares = share_one, np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
     apart = start[other] - start[one]
     bend = _bend(apart, goal[other] - goal[one] - apart)
-    for k in range(ROUNDS):
-        if k == BENDS:
-            bend = np.ones_like(bend)
-        push, most_m = _push(at[other] - at[one], apart, bend)
-        np.add.at(at, other, share_other * push)
-        np.subtract.at(at, one, share_one * push)
-        if most_m < ENOUGH_M:
-            break
+    at = _pushed(goal, one, other, shares, apart, bend)
+    if stand is not None and stand.any():
+        nowhere = stand & (np.abs(goal - at) > np.abs(goal - start) - STIRS_M)
+        at = _pushed(np.where(nowhere, start, at), one, other, shares, apart, np.ones_like(bend))
     step = at - start
     at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
-    if stand is not None and stand.any():
-        nowhere = np.abs(goal - at) > np.abs(goal - start) - STIRS_M
-        at = _settled(at, np.where(stand & nowhere, start, at), one, other)
     return np.column_stack([at.real, at.imag])
 
 
-def _settled(at: Complex, rather: Complex, one: NDArray[np.intp], other: NDArray[np.intp]) -> Complex:
-    """`rather` for those who are in nobody's way there, `at` for the others."""
-    crowded = np.abs(rather[other] - rather[one]) < KEEP_M - ENOUGH_M
-    gives_way = np.zeros(len(at), dtype=bool)
-    gives_way[one[crowded]] = gives_way[other[crowded]] = True
-    return np.where(gives_way, at, rather)
+def _pushed(
+    at: Complex,
+    one: NDArray[np.intp],
+    other: NDArray[np.intp],
+    shares: tuple[Floats, Floats],
+    before: Complex,
+    bend: Complex,
+) -> Complex:
+    """Where people end up who are at `at` (N,) and give way to each other by `shares` (P,) of what is lacking.
+
+    before (P,): from the first of each pair to the second at the beginning of the step. bend: see `_bend`.
+    """
+    at = at.copy()
+    for k in range(ROUNDS):
+        if k == BENDS:
+            bend = np.ones_like(bend)
+        push, most_m = _push(at[other] - at[one], before, bend)
+        np.add.at(at, other, shares[1] * push)
+        np.subtract.at(at, one, shares[0] * push)
+        if most_m < ENOUGH_M:
+            break
+    return at
 
 
 def _points(xy: Floats) -> Complex:
