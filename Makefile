@@ -19,7 +19,7 @@ run: .venv/run.stamp
 
 test: .venv/dev.stamp
 	@$(BIN)/python -m pytest -m "not engine"
-	@$(BIN)/python -m pytest -m engine
+	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
 
 check: .venv/dev.stamp
 	@$(BIN)/ruff check .
