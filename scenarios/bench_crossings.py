@@ -85,7 +85,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
     context = multiprocessing.get_context("spawn")
     names, done = [""] * count, 0
     try:
-        with ProcessPoolExecutor(1, context, initializer=quiet, initargs=(os.getpid(),)) as alone:
+        with ProcessPoolExecutor(1, context, initializer=die_with, initargs=(os.getpid(),)) as alone:
             scenarios = alone.submit(drawn, city, count).result()
             names = [scenario.id for scenario in scenarios]
             for scenario in scenarios:
@@ -94,12 +94,6 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
     except BrokenProcessPool:
         for name in names[done:]:
             yield Crossed(scenario=name, city=city.name, crossing="", ended="crashed", reason="the process died")
-
-
-def quiet(parent: int) -> None:
-    """Tie this process to its parent, and keep the engines' greetings off its table."""
-    die_with(parent)
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
 
 
 def drawn(city: City, count: int) -> list[Scenario]:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from typing import Final
 
-import msgspec
 import numpy as np
 
 from cosim.errors import CosimError, MapError
 from cosim.geometry import Polyline
-from cosim.scenario import CrowdSpec, Place, Scenario
+from cosim.scenario import Place, Scenario
 from cosim.streetmap import Port, StreetMap
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
+from scenarios.drawing import Refusals, along
 from scenarios.long_horizon import on_road_m, route_crossings
 
 BEFORE_M: Final = 10.0
@@ -32,7 +32,7 @@ def build_all(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, 
     strips = street_map.strips
     signalised = sorted(s for s in graph.main_strips - street_map.steep if strips[s].signalised)
     found: list[Scenario] = []
-    refusals: dict[str, int] = {}
+    refusals = Refusals()
     for i in rng.permutation(len(signalised)).tolist():
         if len(found) == count:
             break
@@ -41,12 +41,10 @@ def build_all(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, 
         try:
             found.append(_over(place, street_map, graph, enter, seed * 1000 + len(found), scenario_id))
         except CosimError as refusal:
-            reason = str(refusal).split(":")[0]
-            refusals[reason] = refusals.get(reason, 0) + 1
+            refusals.add(refusal)
     if len(found) < count:
-        told = "; ".join(f"{reason} ({n} times)" for reason, n in refusals.items())
         raise MapError(
-            f"map '{street_map.name}' has {len(found)} signalised crossings to drive over, not {count}. {told}"
+            f"map '{street_map.name}' has {len(found)} signalised crossings to drive over, not {count}. {refusals}"
         )
     return found
 
@@ -63,17 +61,14 @@ def _over(place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, se
     crossings = route_crossings(street_map, route, way[1:])
     if on_road_m(street_map, route, crossings) > OFF_ROAD_M:
         raise MapError("the way lies on a road")
-    start, goal = route.at(0.0), route.at(route.length_m)
-    return Scenario(
-        id=scenario_id,
+    return along(
+        route,
+        crossings,
+        place,
+        street_map,
         suite="crossings",
-        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
         seed=seed,
-        start=(start.x_m, start.y_m, start.heading_rad),
-        goal=(goal.x_m, goal.y_m),
-        route=tuple((float(x), float(y)) for x, y in route.points),
-        crossings=crossings,
-        crowd=CrowdSpec(),
+        scenario_id=scenario_id,
         time_limit_s=LIMIT_S,
     )
 

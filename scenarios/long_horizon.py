@@ -17,7 +17,7 @@ from cosim.streetmap import Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
 from scenarios.barriers import barrier_at, branches, prove_single_path
-from scenarios.drawing import first_that_fits
+from scenarios.drawing import along, first_that_fits
 
 SHORTEST_M = 120.0
 LONGEST_M = 560.0
@@ -75,21 +75,18 @@ def _draw(
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
     barriers = _barriers(street_map, route, way)
-    start, goal = route.at(0.0), route.at(route.length_m)
-    return Scenario(
-        id=scenario_id,
+    bare = along(
+        route,
+        crossings,
+        place,
+        street_map,
         suite="long-horizon",
-        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
         seed=seed,
-        start=(start.x_m, start.y_m, start.heading_rad),
-        goal=(goal.x_m, goal.y_m),
-        route=tuple((float(x), float(y)) for x, y in route.points),
-        crossings=crossings,
-        barriers=barriers,
-        events=draw_events(street_map, route, way, rng),
-        crowd=CrowdSpec(groups=IN_GROUPS),
+        scenario_id=scenario_id,
         time_limit_s=max(300.0, route.length_m / 0.2),
     )
+    events = draw_events(street_map, route, way, rng)
+    return msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
 
 
 def _barriers(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:

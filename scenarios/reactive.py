@@ -18,7 +18,7 @@ from cosim.geometry import Floats, Polyline
 from cosim.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Port, StreetMap, Strip
 from cosim.walks import WalkGraph
-from scenarios.drawing import first_that_fits
+from scenarios.drawing import along, first_that_fits
 from scenarios.long_horizon import route_crossings
 
 LIMIT_S = 60.0
@@ -193,20 +193,20 @@ def _scenario(
     seed: int,
     scenario_id: str,
 ) -> Scenario:
-    line = Polyline(route)
-    start, goal = line.at(0.0), line.at(line.length_m)
-    return Scenario(
-        id=scenario_id,
+    bare = along(
+        Polyline(route),
+        crossings,
+        place,
+        street_map,
         suite="reactive",
-        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
         seed=seed,
-        start=(start.x_m, start.y_m, start.heading_rad),
-        goal=(goal.x_m, goal.y_m),
-        route=tuple((float(x), float(y)) for x, y in line.points),
-        crossings=crossings,
+        scenario_id=scenario_id,
+        time_limit_s=LIMIT_S,
+    )
+    return msgspec.structs.replace(
+        bare,
         events=(event,),
         crowd=CROWD,
-        time_limit_s=LIMIT_S,
         ends_on_failure=True,
         ends_at="stop" if event.kind == "gesturing" else "goal",
     )

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cosim.geometry import Floats
+from cosim.steering import LEAST_M
 
-KEEP_M: Final = 0.45
+KEEP_M: Final = LEAST_M
 """Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
 
 NEAR_M: Final = 0.6

@@ -33,7 +33,7 @@ from sumo_nets.entrances import Entrances, Kept
 from sumo_nets.kerbs import Kerbs
 from sumo_nets.lights import Signals
 from sumo_nets.proxy import Proxy, Walks
-from sumo_nets.smooth import PoseFilter
+from sumo_nets.smooth import STANDING_MPS, PoseFilter
 from sumo_nets.together import Together
 
 TICK_MS = 50
@@ -48,7 +48,6 @@ WARM_UP_S = 8.0
 SIGNAL_CLOCK_S = 3600
 """The signals' clocks start somewhere in this span, drawn from the seed."""
 
-STANDING_MPS = 0.1
 PEDESTRIANS, DRIVERS = "pedestrians", "drivers"
 NOWHERE_M = -1e8
 """Who has not set out yet is beyond this."""

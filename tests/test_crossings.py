@@ -56,21 +56,27 @@ def test_a_city_has_only_so_many_crossings() -> None:
         build_all(SMALL, street_map, WalkGraph(street_map), 3, 10_000)
 
 
-def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red() -> None:
-    """One crossing from the command line: the robot arrives, nothing at red by it; people and vehicles are counted."""
-    words = ["bench", "crossings", "--crossings", "1", "--policy", "orca"]
+def bench_crossings(*words: str, columns: int, cwd: Path | None = None) -> str:
+    """What `cosim bench crossings` prints."""
     done = subprocess.run(
-        [sys.executable, "-m", "cosim", *words],
+        [sys.executable, "-m", "cosim", "bench", "crossings", *words],
+        cwd=cwd,
         capture_output=True,
         text=True,
         timeout=300.0,
         check=False,
-        env=os.environ | {"COLUMNS": "160"},
+        env=os.environ | {"COLUMNS": str(columns)},
     )
     assert done.returncode == 0, done.stderr
-    rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", done.stdout)}
+    return done.stdout
+
+
+def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red() -> None:
+    """One crossing from the command line: the robot arrives, nothing at red by it; people and vehicles are counted."""
+    told = bench_crossings("--crossings", "1", "--policy", "orca", columns=160)
+    rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", told)}
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
-    assert int(re.findall(r"(\d+) vehicles passed stop lines", done.stdout)[0]) > 0
+    assert int(re.findall(r"(\d+) vehicles passed stop lines", told)[0]) > 0
 
 
 DIES = """
@@ -98,18 +104,8 @@ class Dies:
 def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path) -> None:
     """A policy raises at its first crossing; made anew, it ends the process at the second: both rows say which."""
     (tmp_path / "dies.py").write_text(DIES)
-    words = ["bench", "crossings", "--crossings", "2", "--cities", "1", "--policy", "dies:Dies"]
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-        check=False,
-        env=os.environ | {"COLUMNS": "200"},
-    )
-    assert done.returncode == 0, done.stderr
-    (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", done.stdout)
+    told = bench_crossings("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", columns=200, cwd=tmp_path)
+    (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", told)
     assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
 
 

@@ -17,7 +17,7 @@ from shapely.geometry import LineString
 
 from cosim.events import Actor, EventQuery
 from cosim.geometry import wrap_angle
-from cosim.giveway import stepped_round
+from cosim.giveway import stepped_round, within_reach_m
 from cosim.state import Doing
 from cosim.steering import LEAST_M, Neighbour, Vector, steered
 from scenarios.behaviors.walking import robot_of, turned
@@ -241,7 +241,7 @@ def _stepped(
             at[0] + tick_s * (cos * velocity[0] - sin * velocity[1]),
             at[1] + tick_s * (sin * velocity[0] + cos * velocity[1]),
         )
-        if math.dist(at, robot.pose[:2]) < 4.0:
+        if math.dist(onward, robot.pose[:2]) < within_reach_m(robot):
             x, y = stepped_round(np.array([at]), np.array([onward]), robot)[0].tolist()
             onward = x, y
         if graph.free(*onward) and not any(_nearer(at, onward, one) for one in neighbours):
