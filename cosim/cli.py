@@ -13,23 +13,14 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from cosim.cli_bench import bench
+from cosim.cli_board import Board
 from cosim.cli_city import city_app
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
-from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_scenarios, print_sheet, print_table
 from cosim.errors import CosimError, UsageError
 
 app = typer.Typer(
@@ -38,31 +29,29 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
+    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`",
 )
-app.add_typer(city_app, name="city")
-app.add_typer(map_app, name="map")
-app.command(epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`")(
-    look
-)
-app.command(epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(film)
-app.command("counterfactual", epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(compare_one)
-app.command(
-    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
-    "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`"
-)(bench)
-app.command(
-    epilog="Examples:  \n"
-    '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
-    "`cosim inject @anna.json --env mine/lh-011-00`"
-)(inject)
-app.command(epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
-app.command(
-    epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"
-    "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`"
-)(direct)
-app.command(epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
+LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 out = Console()
 err = Console(stderr=True)
+
+
+def say_versions(asked: bool) -> None:
+    """Print the versions and end, if asked for."""
+    if asked:
+        from cosim.versions import in_words
+
+        typer.echo(in_words())
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=say_versions, is_eager=True, help="Say the versions and end.")
+    ] = False,
+) -> None:
+    """Options of `cosim` itself."""
 
 
 @app.command(
@@ -97,7 +86,7 @@ def run(
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
-    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
     live: Annotated[
         str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
     ] = None,
@@ -115,6 +104,7 @@ def run(
     from bridge import keys
     from bridge.director import Outside
     from bridge.session import Session
+    from cosim.cli_tables import kinds_of, print_by_kind, print_table
     from cosim.injection import Live
     from cosim.policies.load import load_policy
     from cosim.record import NO_RENDERER
@@ -198,11 +188,12 @@ def run(
         raise typer.Exit(1)
 
 
-@app.command("list")
+@app.command("list", epilog="Examples:  \n`cosim list`  \n`cosim list reactive`")
 def list_all(
     suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
 ) -> None:
     """List the suites and policies, or the scenarios of a suite."""
+    from cosim.cli_tables import print_scenarios
     from cosim.policies import POLICIES
     from scenarios.catalog import SUITES
     from scenarios.catalog import suite as shipped
@@ -234,6 +225,7 @@ def show(
     ] = False,
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
+    from cosim.cli_tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
     from cosim.results import table_of
     from cosim.runfolder import read_records, read_spec
 
@@ -263,7 +255,7 @@ def show(
         out.print(f"Picture: {path}", soft_wrap=True)
 
 
-@app.command()
+@app.command(epilog="Example:  \n`cosim doctor`")
 def doctor() -> None:
     """Check that every engine works here: versions, a frame, a query, a step."""
     from scenarios.checks import CHECKS
@@ -279,48 +271,36 @@ def doctor() -> None:
         raise typer.Exit(1)
 
 
-class Board:
-    """The progress display of a run: one bar for the suite, one for each episode under way."""
-
-    def __init__(self, total: int, done: int, lengths_m: dict[str, float]) -> None:
-        self.bars = Progress(
-            TextColumn("{task.description}"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("{task.fields[note]}"),
-            TimeElapsedColumn(),
-            TimeRemainingColumn(),
-            console=err,
-        )
-        self._lengths_m = lengths_m
-        self._all = self.bars.add_task("episodes", total=total, completed=done, note="")
-        self._tasks: dict[str, TaskID] = {}
-
-    def tell(self, message: object) -> None:
-        """Take in what a worker says."""
-        from scenarios.messages import Compares, Done, Waits
-        from scenarios.messages import Progress as Report
-
-        if isinstance(message, Report):
-            task = self._tasks.get(message.scenario)
-            if task is None:
-                length_m = round(self._lengths_m[message.scenario])
-                task = self.bars.add_task(f"  {message.scenario}", total=length_m, note="")
-                self._tasks[message.scenario] = task
-            note = f"m  {message.time_s:.0f} s simulated, {message.failures} failures"
-            self.bars.update(task, completed=round(message.route_s_m), note=note)
-        elif isinstance(message, Compares):
-            if message.scenario in self._tasks:
-                note = f"m  the street without the robot: {100.0 * message.share:.0f} %"
-                self.bars.update(self._tasks[message.scenario], note=note)
-        elif isinstance(message, Waits):
-            err.print(f"{message.scenario}: {message.reason}", soft_wrap=True, highlight=False, markup=False)
-        elif isinstance(message, Done):
-            task = self._tasks.pop(message.scenario, None)
-            if task is not None:
-                self.bars.remove_task(task)
-            self.bars.advance(self._all)
-            err.print(f"{message.scenario}: {message.status}")
+app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`",
+)(look)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(
+    film
+)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
+app.command("counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(
+    compare_one
+)
+app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Examples:  \n"
+    '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
+    "`cosim inject @anna.json --env mine/lh-011-00`",
+)(inject)
+app.command(rich_help_panel=STEP_IN, epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
+app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"
+    "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`",
+)(direct)
+app.command(
+    rich_help_panel=MEASURE,
+    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
+    "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
+)(bench)
+app.add_typer(city_app, name="city", rich_help_panel=PLACES)
+app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 
 
 def main() -> None:

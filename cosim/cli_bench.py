@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
+from cosim.errors import unknown
 
 out = Console()
 err = Console(stderr=True)
@@ -16,10 +17,11 @@ err = Console(stderr=True)
 
 def bench(
     what: Annotated[
-        Literal["environment", "camera", "crowd", "crossings"],
+        str,
         typer.Argument(
-            help="One environment process, the cameras side by side, how people and vehicles behave, or how a policy, "
-            "they and the lights get on."
+            metavar="WHAT",
+            help="environment (one process, part by part), camera (all of them side by side), crowd (how people and "
+            "vehicles behave) or crossings (how a policy, they and the lights get on).",
         ),
     ] = "environment",
     rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
@@ -36,6 +38,9 @@ def bench(
     children: Annotated[float, typer.Option(help=f"For `crowd`: {CHILDREN_HELP}")] = 0.0,
 ) -> None:
     """Measure one environment process, part by part, the cameras, or what robot, people and vehicles do in traffic."""
+    choices = ("environment", "camera", "crowd", "crossings")
+    if what not in choices:
+        raise unknown("bench", what, choices)
     if what == "crowd":
         bench_crowd(3 if cities is None else cities, minutes, residents, groups, elderly, children)
         return

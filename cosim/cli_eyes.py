@@ -20,7 +20,10 @@ out = Console()
 err = Console(stderr=True)
 
 Choice = Literal["auto", "gl", "bullet", "bullet-egl"]
-CAMERA_HELP = "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), or auto: gl where it works."
+CAMERA_HELP = (
+    "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), bullet-egl (bare, by OpenGL), or auto: gl "
+    "where it works, else bullet."
+)
 RESIDENTS_HELP = "In place of the scenario's: so many people who sit on benches, look into shop windows, wait at stops."
 
 
@@ -48,7 +51,7 @@ def look(
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
-    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
     from scenarios.catalog import chosen, with_crowd
@@ -76,7 +79,7 @@ def film(
     size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
     view: Annotated[str, typer.Option(help="follow (from behind), above, or robot: what it sees.")] = "follow",
     speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
-    camera: Annotated[Choice, typer.Option(help=CAMERA_HELP)] = "auto",
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Film an episode of a run: from behind the robot or above it, with what it sees, the map, events and failures."""
     from scenarios.film import Cut, film

@@ -1,0 +1,102 @@
+"""What the command line says of itself: help with examples, versions; no engine is started for it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from cosim.cli import app
+
+FIRST = ("run", "list", "show", "doctor")
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command below a group, with the words that call it."""
+    for name, command in getattr(group, "commands", {}).items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*words, name))
+        else:
+            yield (*words, name), command
+
+
+COMMANDS = dict(commands(get_command(app)))
+
+
+def said(*words: str) -> str:
+    """What `cosim WORDS` prints in a terminal of 80 columns."""
+    result = CliRunner().invoke(app, list(words), terminal_width=80, color=False, env={"COLUMNS": "80"})
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
+    """The help ends with an example that begins with the command, and each example's options exist."""
+    epilog = COMMANDS[words].epilog or ""
+    examples = re.findall(r"`(cosim [^`]+)`", epilog)
+    own = [example for example in examples if example.startswith(" ".join(("cosim", *words)))]
+    assert own, f"no example in the help of {' '.join(words)}"
+    options = {option for parameter in COMMANDS[words].params for option in parameter.opts}
+    for example in own:
+        assert set(re.findall(r"(?<!\S)--?[a-z][a-z-]*", example)) <= options, example
+
+
+@pytest.mark.parametrize("words", [(), ("city",), ("map",), *COMMANDS], ids=" ".join)
+def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
+    """No line is longer, nothing is cut, and no list of choices is broken in the middle of a word."""
+    lines = said(*words, "--help").splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    assert not re.findall(r"<[a-z|-]*[|][a-z|-]*(?![a-z|>-])", "\n".join(lines))
+
+
+def test_what_a_newcomer_needs_comes_first() -> None:
+    """`cosim --help` begins with the commands of the README's first section."""
+    shown = said("--help")
+    places = [shown.index(f"│ {name} ") for name in FIRST]
+    assert places == sorted(places)
+    others = {words[0] for words in COMMANDS} - set(FIRST)
+    assert all(shown.index(f"│ {name} ") > places[-1] for name in others)
+
+
+def test_the_version_is_said_without_an_engine() -> None:
+    """`cosim --version` names the project, Python and the engines; it imports no engine and no pandas."""
+    code = (
+        "import sys\n"
+        "from typer.testing import CliRunner\n"
+        "from cosim.cli import app\n"
+        "print(CliRunner().invoke(app, ['--version']).output)\n"
+        "slow = {'libsumo', 'pybullet', 'zenoh', 'moderngl', 'pandas', 'scipy', 'shapely', 'cv2'}\n"
+        "print(sorted(slow & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    *lines, imported = done.stdout.strip().splitlines()
+    assert imported == "[]"
+    text = "\n".join(lines)
+    assert f"cosim {version('sidewalk-cosim')}" in text and f"Python {sys.version.split()[0]}" in text
+    for name, package in (("SUMO", "libsumo"), ("PyBullet", "pybullet"), ("Zenoh", "eclipse-zenoh")):
+        assert f"{name} {version(package)}" in text
+
+
+def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`cosim --version` is for a broken machine too."""
+    from importlib.metadata import PackageNotFoundError
+
+    from cosim import versions
+
+    def without(package: str) -> str:
+        if package == "pybullet":
+            raise PackageNotFoundError(package)
+        return "1.2"
+
+    monkeypatch.setattr(versions, "version", without)
+    assert "PyBullet missing" in said("--version") and "SUMO 1.2" in said("--version")
