@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
@@ -76,7 +76,7 @@ def test_shipped_seeds_are_a_hundred_different_ones() -> None:
     assert len({city.name for city in shipped_cities()}) == 100
 
 
-@settings(max_examples=7, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=7)
 @given(
     seed=st.integers(0, 2**31),
     size_m=st.floats(200.0, 1200.0).map(lambda size: round(size, 1)),

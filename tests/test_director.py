@@ -160,7 +160,11 @@ def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> N
     assert told == ["waits at tick 3 for the director, 20 s at most"]
 
 
-@pytest.mark.parametrize("payload", [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x91" * 100_000, b"\x80\x04."])
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x91" * 100_000, b"\x80\x04."],
+    ids=["empty", "unused byte", "map", "long array", "deep", "pickled"],
+)
 def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None:
     """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
     with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:

@@ -13,7 +13,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 import pytest
 import shapely
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cosim.errors import MapError
@@ -357,7 +357,7 @@ KEYS = st.sampled_from(
 )
 
 
-@settings(max_examples=150, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=150)
 @given(data=st.data())
 def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     """Any tags, outlines, members and missing nodes: no exception, only finite things of sound height and outline."""

@@ -115,6 +115,8 @@ def test_the_log_alone_replays_the_guests() -> None:
         (b"x" * (LARGEST_B + 1), f"at most {LARGEST_B}"),
         (b"", ""),
     ],
+    ids=["fast", "off the map", "no path", "no name", "misspelt", "negative stay", "nan", "packed nan", "packed inf",
+         "cut short", "deep", "large", "empty"],
 )  # fmt: skip
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
     """Nothing of it reaches the simulation."""

@@ -81,7 +81,7 @@ pairs = st.tuples(numbers, numbers)
 directions = st.floats(-math.pi, math.pi)
 
 
-@settings(max_examples=200, deadline=None, derandomize=True)
+@settings(max_examples=200)
 @given(st.tuples(st.floats(-6.0, 6.0), st.floats(-6.0, 6.0)), pairs, pairs)
 def test_a_permitted_velocity_keeps_clear_for_the_horizon(
     apart: tuple[float, float], mine: tuple[float, float], other: tuple[float, float]
@@ -95,7 +95,7 @@ def test_a_permitted_velocity_keeps_clear_for_the_horizon(
     assert closest(np.array(apart), v - np.array(other), 2.0) >= 1.0 - 1e-4
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150)
 @given(st.lists(st.tuples(directions, st.floats(-1.8, 1.8)), min_size=1, max_size=7), pairs)
 def test_the_programme_agrees_with_a_search_of_all_velocities(
     made: list[tuple[float, float]], preferred: tuple[float, float]

@@ -117,7 +117,9 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         read_records(tmp_path / "other")
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b'{"scenario": 3}', b"\x80\x04pickle"])
+@pytest.mark.parametrize(
+    "content", [b"", b"{", b'{"scenario": 3}', b"\x80\x04pickle"], ids=["empty", "cut short", "of numbers", "pickled"]
+)
 def test_a_damaged_record_is_named(tmp_path: Path, content: bytes) -> None:
     """A record that is cut off or of another kind is refused with its path."""
     path = tmp_path / "record.json"

@@ -189,7 +189,7 @@ LINES = st.lists(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(LINES, st.sampled_from(["street", "path", "steps", "raised"]), st.booleans())
 def test_no_elevations_are_too_bad_to_be_read(
     lines: list[list[tuple[float, float, float]]], on: On, ring: bool

@@ -1,0 +1,65 @@
+"""The list of tests itself: the same in every process and at any time, and names that can be read."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import PATIENCE_S
+
+ROOT = Path(__file__).parents[1]
+COLLECT = (sys.executable, "-m", "pytest", "-o", "addopts=--import-mode=importlib", "--collect-only", "-q", "tests")
+LONGEST_PARAMETERS = 120
+
+
+@pytest.fixture(scope="module")
+def twice() -> list[list[str]]:
+    """The ids of all tests, engine tests too, as two processes collect them side by side, a second apart."""
+    processes = []
+    for hash_seed in ("1", "2"):
+        environment = os.environ | {"PYTHONHASHSEED": hash_seed}
+        processes.append(subprocess.Popen(COLLECT, cwd=ROOT, env=environment, stdout=subprocess.PIPE, text=True))
+        time.sleep(1.1)
+    said = [process.communicate(timeout=PATIENCE_S)[0] for process in processes]
+    assert [process.returncode for process in processes] == [0, 0], said
+    return [[line for line in lines.splitlines() if "::" in line] for lines in said]
+
+
+def unreadable(test_id: str) -> bool:
+    """Whether the parameters in an id are too long to read, or hold bytes that stand for no letter."""
+    parameters = test_id.partition("[")[2]
+    escaped = "\\" in parameters.replace(r"\\", "")
+    return len(parameters) > LONGEST_PARAMETERS or escaped or not test_id.isprintable()
+
+
+def test_two_processes_collect_the_same_tests(twice: list[list[str]]) -> None:
+    """Ids depend neither on the clock nor on the order of sets: processes that share the tests out must agree."""
+    first, second = twice
+    assert len(first) == len(set(first)) > 900
+    assert first == second
+
+
+def test_every_id_can_be_read(twice: list[list[str]]) -> None:
+    """No id is made of bytes or of a whole message: it can be typed, and stands in one line."""
+    assert [test_id for test_id in twice[0] if unreadable(test_id)] == []
+
+
+@pytest.mark.parametrize(
+    ("test_id", "refused"),
+    [
+        ("tests/test_a.py::test_b[good-2-words in a row]", False),
+        ("tests/test_a.py::test_b[body\\\\.npz]", False),
+        ("tests/test_a.py::test_b[\\x1f\\x8b\\x08]", True),
+        ("tests/test_a.py::test_b[one\\ntwo]", True),
+        ("tests/test_a.py::test_b[" + 200 * "a" + "]", True),
+    ],
+    ids=["words", "an escaped dot", "bytes", "two lines", "long"],
+)
+def test_ids_of_bytes_and_long_ones_are_refused(test_id: str, refused: bool) -> None:
+    """What the check above refuses, by example."""
+    assert unreadable(test_id) is refused
