@@ -25,14 +25,31 @@ SHOWN = (
     ("freezings_per_100m", "F"),
     ("velocity_mean_mps", "V"),
 )
-COUNTS = (("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"))
-BY_KIND = (("success", "SR"), ("collisions", "C"), ("out_of_lane", "OL"), ("freezings", "F"), ("rules_broken", "rules"))
-"""Means over the episodes of a kind of event."""
+LETTERS = {
+    "SR": "success: the goal reached in time without a failure",
+    "RC": "share of the route done",
+    "FC": "failures per 100 m",
+    "C": "collisions per 100 m",
+    "OL": "out of lane per 100 m",
+    "F": "freezings per 100 m",
+    "V": "mean speed",
+}
+"""What a letter means, in every table: what is counted otherwise has no letter."""
+UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
+COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
+BY_KIND = (
+    ("collisions", "collided"),
+    ("out_of_lane", "left\nlane"),
+    ("freezings", "froze"),
+    ("rules_broken", "broke\nrule"),
+)
+"""Shares of the episodes of a kind of event: each ends on its first failure."""
 
 
 def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     """The table of a run: a row per episode, then the means with their intervals. Made for 80 columns."""
-    numbers = (Column(head, no_wrap=True, justify="right") for head in (*(head for _, head in SHOWN), "C/OL/F"))
+    heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
     shown = Table(
         Column("episode", no_wrap=True), Column("ended", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0
     )
@@ -41,6 +58,8 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
         ended = row["ended"] if row["status"] == "done" else row["status"]
         shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
     out.print(shown)
+    counted = "/".join(name for _, name in COUNTS)
+    out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
     if len(table):
         means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
         for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
@@ -115,18 +134,23 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
     if len(set(kinds.values())) < 2:
         return
-    heads = ("event", "n", *(head for _, head in BY_KIND), "95 % of SR", "invalid", "least m")
-    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    heads = ("n", "SR", "95 % of SR", *(head for _, head in BY_KIND), "invalid", "nearest\nm")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
+    shown = Table(Column("event", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
     for kind in dict.fromkeys(kinds.values()):
         part = table[table["scenario"].map(kinds) == kind]
-        values = {name: pd.to_numeric(part[name], errors="coerce").dropna() for name, _ in BY_KIND}
-        low, high = interval_of(values["success"].to_numpy(dtype=float))
+        success, *shares = (
+            pd.to_numeric(part[name], errors="coerce").dropna() for name in ("success", *(name for name, _ in BY_KIND))
+        )
+        low, high = interval_of(success.to_numpy(dtype=float))
         nearest = pd.to_numeric(part["pedestrian_distance_min_m"], errors="coerce").min()
-        means = (f"{values[name].mean():.2f}" if len(values[name]) else "-" for name, _ in BY_KIND)
-        interval = f"{low:.2f}..{high:.2f}" if len(values["success"]) else "-"
+        interval = f"{low:.2f}..{high:.2f}" if len(success) else "-"
         invalid = str((part["status"] == "invalid").sum())
-        shown.add_row(kind, str(len(part)), *means, interval, invalid, "-" if pd.isna(nearest) else f"{nearest:.2f}")
+        cells = (_cell(values.mean()) for values in shares)
+        shown.add_row(kind, str(len(part)), _cell(success.mean()), interval, *cells, invalid, _cell(nearest))
     out.print(shown)
+    named = ", ".join(head.replace("\n", " ") for _, head in BY_KIND)
+    out.print(f"n episodes; {named}: share of the event's episodes; nearest: least distance to a person's centre")
 
 
 def print_sheet(out: Console, folder: Path) -> None:
@@ -134,7 +158,7 @@ def print_sheet(out: Console, folder: Path) -> None:
     from scenarios.eventsheet import sheet_of_run, summary
 
     sheet = sheet_of_run(folder)
-    heads = ("trigger", "error", "tick", "m/s", "stated", "left", "angle", "least")
+    heads = ("trigger\nm", "error\nm", "tick\nm", "speed\nm/s", "stated\nm/s", "left\nm", "angle\ndeg", "least\nm")
     rows = Table(Column("episode", no_wrap=True), *(Column(head, justify="right") for head in heads), box=None)
     for row in sheet.itertuples(index=False):
         name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
@@ -147,3 +171,9 @@ def print_sheet(out: Console, folder: Path) -> None:
         for row in short.itertuples(index=False):
             table.add_row(*(str(value) for value in row))
         out.print(table)
+    out.print(
+        "trigger: from the robot to the event's place, when it began; error: off what is stated; tick: what the robot "
+        "drove in a tick, the most that the error may be; off: triggers beyond that; speed: of the person while it "
+        "walks, stated: of the scenario; left: of the middle of the way; angle: of its walk to the robot's heading; "
+        "least: distance between the centres of person and robot"
+    )
