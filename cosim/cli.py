@@ -21,7 +21,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_on
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
-from cosim.errors import CosimError, UsageError
+from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, UsageError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -179,13 +179,15 @@ def run(
             again += "" if folder else f" --out {shlex.quote(str(path))}"
             err.print(f"Stopped. {finished} of {len(picked)} episodes are finished and kept in {path}.")
             err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
         table = held.finish()
     print_table(out, table, len(picked))
     print_by_kind(out, table, kinds_of(path))
     out.print(f"Run folder: {path}", soft_wrap=True)
-    if (table["status"] == "crashed").any():
-        raise typer.Exit(1)
+    if lacking := [s.id for s in picked if s.id not in set(table["scenario"])]:
+        err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
+    if lacking or (table["status"] == "crashed").any():
+        raise typer.Exit(SOME_CRASHED)
 
 
 @app.command("list", epilog="Examples:  \n`cosim list`  \n`cosim list reactive`")
@@ -268,7 +270,7 @@ def doctor() -> None:
             failed += 1
             out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {escape(str(error))}", soft_wrap=True)
     if failed:
-        raise typer.Exit(1)
+        raise typer.Exit(BROKEN_MACHINE)
 
 
 app.command(
@@ -308,12 +310,9 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         app()
-    except UsageError as error:
-        err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-        raise SystemExit(2) from None
     except CosimError as error:
         err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-        raise SystemExit(1) from None
+        raise SystemExit(error.exit_code) from None
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column, Table
 
 from cosim.box import box_of
+from cosim.errors import SOME_CRASHED
 
 if TYPE_CHECKING:
     from cosim.report.legend import Image
@@ -95,7 +96,7 @@ def table(
             bar.advance(task)
     print_cities(found)
     if any(one.faults for one in found):
-        raise typer.Exit(1)
+        raise typer.Exit(SOME_CRASHED)
 
 
 @city_app.command(

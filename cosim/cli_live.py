@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from cosim.errors import EngineError, UsageError, unknown
+from cosim.errors import INTERRUPTED, WRONG_USE, EngineError, UsageError, unknown
 
 out = Console()
 err = Console(stderr=True)
@@ -30,7 +30,7 @@ def inject(
     connect: Connect = DEFAULT,
     env: Env = None,
 ) -> None:
-    """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 1: refused."""
+    """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 2: refused."""
     from bridge.live import inject as send
     from bridge.session import Session
 
@@ -40,7 +40,7 @@ def inject(
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
         err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
-        raise typer.Exit(1)
+        raise typer.Exit(WRONG_USE)
     out.print(f"'{ack.id}' enters at tick {ack.tick}, {ack.time_s:.2f} s", highlight=False)
 
 
@@ -64,7 +64,7 @@ def listen(
         try:
             time.sleep(seconds if seconds is not None else 1e9)
         except KeyboardInterrupt:
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
 
 
 def direct(
@@ -85,7 +85,7 @@ def direct(
             while True:
                 time.sleep(3600.0)
         except KeyboardInterrupt:
-            raise typer.Exit(130) from None
+            raise typer.Exit(INTERRUPTED) from None
 
 
 def replay(

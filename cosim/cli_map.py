@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.box import box_of
-from cosim.errors import MapError, UsageError
+from cosim.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 
 if TYPE_CHECKING:
     from cosim.mapcheck import MapCheck
@@ -55,7 +55,7 @@ def import_(
     print_check(check, about)
     out.print(f"Kept as '{about.name}': see it with `cosim map check {about.name} -o map.png`.", soft_wrap=True)
     if not check.usable:
-        raise typer.Exit(1)
+        raise typer.Exit(WRONG_USE)
 
 
 @map_app.command(
@@ -87,7 +87,7 @@ def check(
         if picture is not None:
             out.print(f"Picture: {picture}", soft_wrap=True)
     if not found.usable:
-        raise typer.Exit(1)
+        raise typer.Exit(WRONG_USE)
 
 
 @map_app.command(
@@ -117,7 +117,7 @@ def endure(
         table.add_row(name, *cells, escape(done.reason or "its time"))
     out.print(table)
     if failed:
-        raise typer.Exit(1)
+        raise typer.Exit(SOME_CRASHED)
 
 
 @map_app.command("list", epilog="Example:  \n`cosim map list`")

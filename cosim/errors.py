@@ -1,19 +1,29 @@
-"""The errors of the project, in one tree.
+"""The errors of the project, in one tree, and the exit codes of the command line, one meaning each.
 
-CosimError                what a user can mend: shown as one message, exit code 1
-├── UsageError            a name or an option that does not exist: exit code 2
-├── SpecError             a scenario, suite or place that contradicts itself (also a ValueError)
-├── MapError              a street net that cannot be read or built
-├── PolicyError           a policy that raised, or answered with something unusable
-├── EngineError           SUMO, PyBullet or Zenoh failed or was misused
-│   └── DirectorLost      the director of the event pedestrians did not answer
-└── RunError              a run folder that is locked, broken or of another run
+CosimError                what a user can mend: shown as one message
+├── UsageError         2  a name or an option that does not exist, a policy that cannot be loaded
+├── SpecError          2  a scenario, suite or place that contradicts itself (also a ValueError)
+├── MapError           2  a street net that cannot be read or built
+├── RunError           2  a run folder that is locked, broken or of another run
+├── PolicyError        1  a policy that raised, or answered with something unusable
+├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
+│   └── DirectorLost   3  the director of the event pedestrians did not answer
+└── MachineError       3  a full disk, a folder that cannot be written, a library or program that is missing
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from difflib import get_close_matches
+from pathlib import Path
+from typing import ClassVar
+
+ALL_SCORED = 0
+SOME_CRASHED = 1
+"""The run ended, but not all of it is scored."""
+WRONG_USE = 2
+BROKEN_MACHINE = 3
+INTERRUPTED = 130
 
 MOST_LISTED = 30
 """Of more valid choices than these, five are listed: those most like what was asked for, else the first."""
@@ -22,33 +32,58 @@ MOST_LISTED = 30
 class CosimError(Exception):
     """Root of every error this project raises on purpose. The message says what to do."""
 
+    exit_code: ClassVar[int] = BROKEN_MACHINE
+
 
 class UsageError(CosimError):
     """A name or option that does not exist; the message lists the valid choices."""
+
+    exit_code = WRONG_USE
 
 
 class SpecError(CosimError, ValueError):
     """A spec that contradicts itself or the place it stands in."""
 
+    exit_code = WRONG_USE
+
 
 class MapError(CosimError):
     """A street net that cannot be read, built or walked on."""
+
+    exit_code = WRONG_USE
+
+
+class RunError(CosimError):
+    """A run folder that is in use, broken, or belongs to another run."""
+
+    exit_code = WRONG_USE
 
 
 class PolicyError(CosimError):
     """A policy that raised, or whose answer is not a command."""
 
+    exit_code = SOME_CRASHED
+
 
 class EngineError(CosimError):
     """An engine (SUMO, PyBullet, Zenoh) that failed or was misused."""
+
+    exit_code = BROKEN_MACHINE
 
 
 class DirectorLost(EngineError):
     """The director of the event pedestrians did not answer in time."""
 
 
-class RunError(CosimError):
-    """A run folder that is in use, broken, or belongs to another run."""
+class MachineError(CosimError):
+    """The machine lacks something: room on the disk, a folder that can be written, a library, a program."""
+
+    exit_code = BROKEN_MACHINE
+
+
+def unwritable(path: Path, error: OSError, remedy: str = "choose another place, or make room") -> MachineError:
+    """The error for a file or folder that cannot be written."""
+    return MachineError(f"{path}: cannot be written: {error.strerror or error}: {remedy}")
 
 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:

@@ -24,7 +24,7 @@ from typing import Self
 import msgspec
 import pandas as pd
 
-from cosim.errors import RunError, unknown
+from cosim.errors import MachineError, RunError, unknown, unwritable
 from cosim.record import Record
 from cosim.results import row_of, table_of
 from cosim.scenario import Suite, write_suite
@@ -75,7 +75,7 @@ class RunFolder:
             temporary.write_bytes(msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
             temporary.replace(path / "run.json")
         except OSError as error:
-            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+            raise unwritable(path, error) from error
         return cls(path, spec)
 
     @classmethod
@@ -145,7 +145,7 @@ class RunFolder:
             with closing(self._database()) as database, database:
                 database.execute("insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text))
         except sqlite3.Error as error:
-            raise RunError(f"{self.path / 'results.sqlite'}: {error}. Finished episodes are safe.") from error
+            raise MachineError(f"{self.path / 'results.sqlite'}: {error}. Finished episodes are safe.") from error
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
@@ -155,7 +155,9 @@ class RunFolder:
             table.to_csv(temporary, index=False)
             temporary.replace(self.path / "results.csv")
         except OSError as error:
-            raise RunError(f"{self.path / 'results.csv'}: {error.strerror}. All episodes are kept.") from error
+            raise unwritable(
+                self.path / "results.csv", error, "all episodes are kept; make room and add --resume"
+            ) from error
         return table
 
     def adopt(self, scenario_id: str) -> bool:

@@ -11,7 +11,7 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
-from cosim.errors import CosimError, EngineError
+from cosim.errors import EngineError, MachineError
 from cosim.events import EventQuery
 from cosim.policies.baselines import Straight
 from cosim.scenario import City, CrowdSpec, Scenario
@@ -36,7 +36,7 @@ def names() -> str:
     owners = packages_distributions()
     for name in OWN:
         if (owner := set(owners.get(name, ["sidewalk-cosim"]))) != {"sidewalk-cosim"}:
-            raise CosimError(f"package '{name}' belongs to {', '.join(sorted(owner))}: use a virtual environment")
+            raise MachineError(f"package '{name}' belongs to {', '.join(sorted(owner))}: use a virtual environment")
     return f"{', '.join(OWN)} are this project's"
 
 
@@ -79,7 +79,7 @@ def frame() -> str:
         assert parts.camera is not None
         picture = parts.camera.render(robot, parts.crowd.street)
         if len(np.unique(picture.rgb.reshape(-1, 3), axis=0)) < 5:
-            raise CosimError("the camera's picture is blank")
+            raise EngineError("the camera's picture is blank")
         height, width, _ = picture.rgb.shape
         people = len(parts.crowd.street.people)
         return f"SUMO walks {people} people, PyBullet holds the robot, {stage.renderer} draws {width}x{height}"

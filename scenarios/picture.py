@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cv2
 
-from cosim.errors import RunError
+from cosim.errors import MachineError, RunError
 from cosim.record import Log, Record
 from cosim.report.above import draw_above
 from cosim.scenario import read_suite
@@ -25,4 +25,4 @@ def draw_episode(folder: Path, scenario_id: str, output: Path) -> None:
     except cv2.error as error:
         raise RunError(f"{output}: cannot be written as a picture; use a name that ends in .png or .jpg") from error
     if not written:
-        raise RunError(f"{output}: the picture cannot be written there")
+        raise MachineError(f"{output}: the picture cannot be written there")

@@ -20,7 +20,7 @@ from pathlib import Path
 import msgspec
 
 from bridge.director import Outside
-from cosim.errors import RunError
+from cosim.errors import MachineError, unwritable
 from cosim.injection import Live
 from cosim.ports import Manifest
 from cosim.record import begun
@@ -35,6 +35,7 @@ SILENCE_S = 300.0
 """A worker that says nothing for so long hangs; a slow policy says something once a simulated second."""
 
 POLL_S = 1.0
+KEPT = "Finished episodes are kept; make room and go on with --resume"
 
 Tell = Callable[[Message], None]
 
@@ -148,7 +149,7 @@ class _Pool:
                 message = decode_message(one.pipe.recv_bytes())
                 one.heard_at = time.monotonic()
                 if isinstance(message, Unsaved):
-                    raise RunError(f"{message.reason}. Finished episodes are kept; make room and go on with --resume.")
+                    raise MachineError(f"{message.reason}. {KEPT}.")
                 if isinstance(message, Done):
                     self._folder.adopt(message.scenario)
                     one.job = None
@@ -179,7 +180,7 @@ class _Pool:
             target.mkdir(parents=True, exist_ok=True)
             record.save(target / "record.json")
         except OSError as error:
-            raise RunError(f"{target}: {error.strerror}. Finished episodes are kept; go on with --resume.") from error
+            raise unwritable(target, error, KEPT) from error
         self._folder.add(record)
         self._tell(Done(scenario.id, "crashed"))
 

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import shapely
 
-from cosim.errors import MapError, UsageError
+from cosim.errors import MachineError, MapError, UsageError
 from cosim.mapcheck import NetFacts
 from cosim.streetmap import Feature
 from sumo_nets.cornermend import mend_corners
@@ -307,7 +307,7 @@ def _start_sumo(file: MapFile, net: Path) -> None:
     except subprocess.TimeoutExpired as error:
         raise MapError(f"{file.source}: SUMO did not start on the net within {START_TIMEOUT_S:g} s") from error
     except OSError as error:
-        raise MapError(f"sumo cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
+        raise MachineError(f"sumo cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
     if done.returncode != 0:
         tail = "\n".join(done.stderr.strip().splitlines()[-6:])
         raise MapError(f"{file.source}: SUMO refuses the net (sumo -n NET -e 1 ends with {done.returncode}):\n{tail}")

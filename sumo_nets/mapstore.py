@@ -15,7 +15,7 @@ from pathlib import Path
 
 import msgspec
 
-from cosim.errors import MapError, UsageError, unknown
+from cosim.errors import MapError, UsageError, unknown, unwritable
 from cosim.mapcheck import MapCheck, check_map
 from cosim.scenario import CityMap
 from cosim.streetmap import StreetMap
@@ -176,7 +176,7 @@ def _keep(source: Path, name: str, options: Options) -> About:
             _replace(ready, folder / name, Path(scratch))
             return about
     except OSError as error:
-        raise MapError(f"{folder}: cannot be written: {error.strerror}; set COSIM_CACHE to another folder") from error
+        raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
 
 
 def _replace(ready: Path, target: Path, scratch: Path) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from cosim.errors import MapError
+from cosim.errors import MachineError, MapError
 from cosim.geometry import Floats
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.elevation import land_of, steep_ports, steep_strips
@@ -51,7 +51,7 @@ def netconvert(arguments: Sequence[str], output: Path, timeout_s: float = 120.0)
     except subprocess.TimeoutExpired as error:
         raise MapError(f"netconvert did not end within {timeout_s:g} s: {shown}") from error
     except OSError as error:
-        raise MapError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed? {shown}") from error
+        raise MachineError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed? {shown}") from error
     tail = "\n".join(done.stderr.strip().splitlines()[-8:])
     if done.returncode != 0 or not output.exists():
         raise MapError(f"netconvert failed with exit code {done.returncode}: {shown}\n{tail}")

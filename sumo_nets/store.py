@@ -12,7 +12,7 @@ from xml.sax.saxutils import quoteattr
 
 import msgspec
 
-from cosim.errors import MapError
+from cosim.errors import MapError, unwritable
 from cosim.scenario import City
 from sumo_nets.blocks import CLASSES, Point
 from sumo_nets.city import plan_city
@@ -90,7 +90,7 @@ def write_city(city: City, folder: Path) -> City:
         about = {"city": made, "generator": GENERATOR, "versions": {name: version(name) for name in MADE_WITH}}
         (folder / ABOUT_NAME).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2) + b"\n")
     except OSError as error:
-        raise MapError(f"{folder}: cannot be written: {error.strerror}") from error
+        raise unwritable(folder, error) from error
     return made
 
 
@@ -106,7 +106,7 @@ def build_city(city: City, path: Path) -> None:
             finished.write_bytes(body + SEAL + _seal(body))
             finished.replace(path)
     except OSError as error:
-        raise MapError(f"{path}: cannot be written: {error.strerror}; set COSIM_CACHE to another folder") from error
+        raise unwritable(path, error, "set COSIM_CACHE to another folder") from error
 
 
 def _build(plan: CityPlan, folder: Path) -> Path:

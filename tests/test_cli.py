@@ -216,7 +216,7 @@ def test_a_full_disk_ends_the_run_with_the_reason(desk: Path) -> None:
     """When a record cannot be written the run stops, says why, and keeps what is finished."""
     out = desk / "full"
     run = cosim("run", "tiny.json", "--policy", "mine:DiskFull", "--out", out.name, cwd=desk)
-    assert run.returncode == 1 and "No space left on device" in run.stderr and "--resume" in run.stderr
+    assert run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
     assert "Traceback" not in run.stderr
     assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"
 
@@ -260,10 +260,10 @@ def test_a_second_run_on_the_same_folder_is_refused(desk: Path) -> None:
     try:
         wait_for(lambda: (desk / "held/results.sqlite").exists())
         second = cosim("run", "tiny.json", "--policy", "mine:Slow", "--out", "held", "--resume", cwd=desk)
-        assert second.returncode == 1
+        assert second.returncode == 2
         assert f"in use by process {run.pid}" in second.stderr
         third = cosim("run", "tiny.json", "--policy", "mine:Slow", "--out", "held", cwd=desk)
-        assert third.returncode == 1 and "already holds a run. Add --resume" in third.stderr
+        assert third.returncode == 2 and "already holds a run. Add --resume" in third.stderr
     finally:
         run.kill()
         run.wait()
@@ -312,7 +312,7 @@ def test_a_broken_suite_file_is_named_with_its_field(desk: Path, change: dict[st
     suite["scenarios"][0] |= change
     (desk / "bad.json").write_text(json.dumps(suite))
     said = cosim("run", "bad.json", "--out", "bad", cwd=desk)
-    assert said.returncode == 1 and "bad.json" in said.stderr and message in said.stderr
+    assert said.returncode == 2 and "bad.json" in said.stderr and message in said.stderr
     assert not (desk / "bad").exists()
 
 
@@ -321,13 +321,13 @@ def test_a_suite_without_scenarios_is_refused(desk: Path) -> None:
     suite = json.loads((desk / "tiny.json").read_text())
     (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
     said = cosim("run", "empty.json", "--out", "empty", cwd=desk)
-    assert said.returncode == 1 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
+    assert said.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
 
 
 def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path) -> None:
     """A wrong endpoint is told with the remedy, and the same command with a right one is not refused."""
     said = cosim("run", "tiny.json", "--live", "tcp/127.0.0.1:99999", "--out", "air", cwd=desk)
-    assert said.returncode == 1 and not (desk / "air").exists()
+    assert said.returncode == 3 and not (desk / "air").exists()
     assert "cannot listen at tcp/127.0.0.1:99999 (invalid port value). Choose" in said.stderr
     heard = cosim("listen", "--connect", "7447", cwd=desk)
     assert heard.returncode == 2 and "--connect '7447': write it as PROTOCOL/ADDRESS" in heard.stderr

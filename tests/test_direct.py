@@ -212,7 +212,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path) -> 
             assert director.react(query).tick == 0
         late.join()
         second = subprocess.run([*WORDS, "direct", "--listen", at], env=ENVIRONMENT, capture_output=True, text=True)
-        assert second.returncode == 1 and f"cannot listen at {at}" in second.stderr
+        assert second.returncode == 3 and f"cannot listen at {at}" in second.stderr
         directors[0].terminate()
         assert directors[0].wait(timeout=10) == 130
     finally:

@@ -351,9 +351,9 @@ def test_command_line(tmp_path: Path) -> None:
     assert done.returncode == 2 and "unknown map 'nowhere'" in done.stderr
     cars = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
     done = cosim("check", cars)
-    assert done.returncode == 1 and "NOT USABLE" in done.stdout
+    assert done.returncode == 2 and "NOT USABLE" in done.stdout
     done = cosim("import", cars)
-    assert done.returncode == 1 and "--upgrade" in done.stderr and "Traceback" not in done.stderr
+    assert done.returncode == 2 and "--upgrade" in done.stderr and "Traceback" not in done.stderr
 
 
 def spoiled(draw: st.DrawFn, data: bytes) -> bytes:

@@ -308,7 +308,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         sent = air.until("-m", "cosim", "inject", message, "--connect", air.at)
         assert "'anna' enters at tick" in sent.stdout
         again = air.cosim("inject", message, "--connect", air.at)
-        assert again.returncode == 1 and "of this id" in again.stderr
+        assert again.returncode == 2 and "of this id" in again.stderr
         elsewhere = air.cosim("inject", message, "--connect", air.at, "--env", "run/t-9")
         assert elsewhere.returncode == 2 and "Valid choices: run/t-0" in elsewhere.stderr
         told = air.cosim("listen", "events", "--connect", air.at, "--seconds", "0.5")
@@ -322,7 +322,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     without = json.dumps(record | {"injections": []})
     (tmp_path / "run" / "episodes" / "t-0" / "record.json").write_text(without)
     differs = air.cosim("replay", "run", "t-0")
-    assert differs.returncode == 1 and "not the same" in differs.stderr
+    assert differs.returncode == 2 and "not the same" in differs.stderr
 
 
 @pytest.mark.engine

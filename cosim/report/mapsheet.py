@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.errors import MapError
+from cosim.errors import unwritable
 from cosim.mapcheck import MapCheck
 from cosim.report.above import TRACK, Sheet, draw_streets
 from cosim.report.legend import Colour, Image, legend
@@ -52,12 +52,12 @@ def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, f
 
 
 def write_png(image: Image, path: Path) -> None:
-    """Write an RGB picture. Raises MapError when the folder cannot be written."""
+    """Write an RGB picture. Raises MachineError when the folder cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
     except OSError as error:
-        raise MapError(f"{path}: cannot be written: {error.strerror}") from error
+        raise unwritable(path, error) from error
 
 
 def _facts(check: MapCheck) -> list[tuple[str, Colour]]:

@@ -10,7 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.errors import RunError
+from cosim.errors import RunError, unwritable
 
 MOST_PX = 4096
 """Longest side of a video."""
@@ -19,7 +19,7 @@ MOST_PX = 4096
 class Video:
     """An .mp4 in the making. Use in a `with` block; the file appears at its end, and only if nothing went wrong.
 
-    size: width, height, both even; fps: pictures a second. Raises RunError when it cannot be written.
+    size: width, height, both even; fps: pictures a second. Raises MachineError when it cannot be written.
     """
 
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
@@ -32,7 +32,7 @@ class Video:
             self._part.touch()
             self._file = av.open(str(self._part), "w", format="mp4")
         except OSError as error:
-            raise RunError(f"{path}: cannot be written: {error.strerror}") from error
+            raise unwritable(path, error) from error
         self._stream = self._file.add_stream("libx264", rate=fps, options={"crf": "21", "preset": "veryfast"})
         self._stream.width, self._stream.height = size
         self._stream.pix_fmt = "yuv420p"
@@ -54,7 +54,7 @@ class Video:
                 self._file.close()
                 self._part.replace(self._path)
         except OSError as problem:
-            raise RunError(f"{self._path}: cannot be written: {problem.strerror}") from problem
+            raise unwritable(self._path, problem) from problem
         finally:
             self._file.close()
             self._part.unlink(missing_ok=True)
@@ -64,4 +64,4 @@ class Video:
             for packet in self._stream.encode(frame):
                 self._file.mux(packet)
         except OSError as error:
-            raise RunError(f"{self._path}: cannot be written: {error.strerror}") from error
+            raise unwritable(self._path, error) from error
