@@ -1,14 +1,32 @@
 """`python -m cosim` is `cosim`; Ctrl-C ends it at any moment with exit code 130, also while it loads."""
 
+from __future__ import annotations
+
+import sys
+
+from cosim import machine
+
+NEED_NO_ENGINE = ("list", "show", "listen", "inject", "direct")
+
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Entry point of the console script. What the machine lacks is said before anything is imported that needs it."""
     try:
-        from cosim.cli import main
-
+        if _starts_an_engine(sys.argv[1:]) and (refusal := machine.refusal()):
+            print(f"error: {refusal}", file=sys.stderr)
+            raise SystemExit(machine.EXIT_CODE)
+        try:
+            from cosim.cli import main
+        except ImportError as error:
+            print(f"error: {error}. The set-up is not whole: `make run` mends it", file=sys.stderr)
+            raise SystemExit(machine.EXIT_CODE) from None
         main()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
+
+
+def _starts_an_engine(words: list[str]) -> bool:
+    return bool(words) and not words[0].startswith("-") and words[0] not in NEED_NO_ENGINE and "--help" not in words
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_on
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
-from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, UsageError
+from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -260,7 +260,10 @@ def show(
 @app.command(epilog="Example:  \n`cosim doctor`")
 def doctor() -> None:
     """Check that every engine works here: versions, a frame, a query, a step."""
-    from scenarios.checks import CHECKS
+    try:
+        from scenarios.checks import CHECKS
+    except ImportError as error:
+        raise EngineError(f"an engine cannot be loaded: {error}. Mend what it names, or set up anew") from error
 
     failed = 0
     for name, check in CHECKS.items():
