@@ -1,48 +1,73 @@
-# One verb per chore. Each target makes its own virtual environment in .venv and does nothing twice.
+# One verb per chore. Each looks first whether the machine has what is needed, makes its virtual environment in .venv and
+# does nothing twice.
 
 PYTHON ?= python3.11
 JOBS ?= 2
 BIN := .venv/bin
-PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test check bench clean
+.PHONY: help run test check bench lock clean machine
 
 help:
 	@echo "make run    run two long-horizon episodes and print their table"
 	@echo "make test   run every test, the fast ones first"
 	@echo "make check  ruff, mypy, import-linter"
 	@echo "make bench  speed and memory, with ratios"
+	@echo "make lock   write the lock files anew after a change of pyproject.toml"
 	@echo "make clean  remove the virtual environment and caches"
 
-run: .venv/run.stamp
+run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy route --episodes 2 --jobs $(JOBS)
 
-test: .venv/dev.stamp
+test: .venv/dev.stamp | machine
 	@$(BIN)/python -m pytest -m "not engine"
 	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
 
-check: .venv/dev.stamp
+check: .venv/dev.stamp | machine
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
 
-bench: .venv/run.stamp
+bench: .venv/run.stamp | machine
 	@$(BIN)/cosim bench
 
-.venv/pip.stamp:
-	@command -v $(PYTHON) >/dev/null || { echo "Python 3.11 is needed: no '$(PYTHON)' here. Name yours: make PYTHON=/path/to/python3.11"; exit 1; }
-	@echo "Setting up .venv (once) ..."
+# Any Python 3 can look; root on Debian or Ubuntu gets what is missing installed, others are told and stopped.
+machine:
+	@python=$$(command -v $(PYTHON) || command -v python3) || { \
+	  echo "error: there is no $(PYTHON). On Debian, as root: apt-get install python3.11 python3.11-venv" >&2; exit 3; }; \
+	$$python -I cosim/machine.py --install --python $(PYTHON)
+
+.venv/pip.stamp: | machine
+	@echo "Set-up, 1 of 3: a virtual environment in .venv"
 	@$(PYTHON) -m venv .venv
 	@touch $@
 
-.venv/run.stamp: .venv/pip.stamp pyproject.toml
-	@$(PIP) install --editable .
+.venv/run.stamp: .venv/pip.stamp requirements.lock pyproject.toml | machine
+	$(call install,requirements.lock)
 	@touch $@
 
-.venv/dev.stamp: .venv/run.stamp pyproject.toml
-	@$(PIP) install --editable '.[dev]'
-	@touch $@
+.venv/dev.stamp: .venv/pip.stamp requirements-dev.lock pyproject.toml | machine
+	$(call install,requirements-dev.lock)
+	@touch .venv/run.stamp $@
+
+# Python compiles a module when it is first imported: doing all of them here would double the time of the set-up.
+define install
+@echo "Set-up, 2 of 3: the packages of $(1), each held against its hash"
+@$(PIP) install --no-compile --require-hashes --requirement $(1)
+@echo "Set-up, 3 of 3: cosim itself"
+@$(PIP) install --quiet --no-deps --no-build-isolation --editable .
+@echo "Set-up is done."
+endef
+
+# Packages that are locked stay as they are while pyproject.toml allows it; delete the files to take the newest of all.
+UV := .venv/lock/bin/uv --no-config pip compile --quiet --generate-hashes --no-emit-index-url --no-annotate
+lock: | machine
+	@test -x .venv/lock/bin/uv || { $(PYTHON) -m venv .venv/lock && .venv/lock/bin/python -m pip install --quiet uv; }
+	@set -e; lock() { $(UV) --custom-compile-command "make lock" --python-version 3.11 \
+	  --python-platform x86_64-manylinux_2_28 pyproject.toml --group build "$$@"; }; \
+	lock --output-file requirements.lock; \
+	lock --output-file requirements-dev.lock --extra dev --constraint requirements.lock
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,4 +1,12 @@
-"""Versions of everything that a state hash depends on."""
+"""Versions of everything that can change the bits of an episode or its pictures.
+
+SUMO moves people and vehicles (libsumo) and builds the nets (netconvert, of eclipse-sumo), PyBullet moves the robot,
+the director's answers come over Zenoh; numpy, scipy and shapely, with the GEOS inside it, compute places, people and
+routes; sines and exponentials are those of the C library's libm. An imported OSM town is read by osmium. Pictures are
+drawn by moderngl in a context of glcontext, and filtered by OpenCV.
+
+Not here, because they only carry or show what was computed: msgspec, pandas, PyAV, rich, typer.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +14,20 @@ import platform
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 
-PACKAGES = ("sidewalk-cosim", "libsumo", "eclipse-sumo", "pybullet", "eclipse-zenoh", "numpy", "scipy", "shapely")
+PACKAGES = (
+    "sidewalk-cosim",
+    "libsumo",
+    "eclipse-sumo",
+    "pybullet",
+    "eclipse-zenoh",
+    "numpy",
+    "scipy",
+    "shapely",
+    "osmium",
+    "moderngl",
+    "glcontext",
+    "opencv-python-headless",
+)
 
 ENGINES = {"SUMO": "libsumo", "PyBullet": "pybullet", "Zenoh": "eclipse-zenoh", "moderngl": "moderngl"}
 """Name for humans -> distribution."""
@@ -14,8 +35,11 @@ ENGINES = {"SUMO": "libsumo", "PyBullet": "pybullet", "Zenoh": "eclipse-zenoh", 
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Installed version of each package, by distribution name."""
-    return {package: version(package) for package in PACKAGES}
+    """Version of each package by distribution name, of `geos` as shapely loaded it, and of the C library `glibc`."""
+    import shapely
+
+    found = {package: version(package) for package in PACKAGES}
+    return {**found, "geos": shapely.geos_version_string, "glibc": platform.libc_ver()[1]}
 
 
 def in_words() -> str:
