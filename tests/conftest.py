@@ -1,14 +1,107 @@
-"""What all tests share: how long anything is waited for, and which examples are drawn."""
+"""What all tests share: how long anything is waited for, which examples are drawn, places, and the command line."""
 
 from __future__ import annotations
 
+import hashlib
+import importlib
+import io
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
+from importlib.metadata import version
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
 from hypothesis import HealthCheck, settings
 
+ROOT = Path(__file__).parents[1]
 PATIENCE_S = 600.0
 """How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test never waits for
 it to be over, so that it costs nothing where all is well."""
+
+WIDE = {"COLUMNS": "160", "NO_COLOR": "1"}
+"""So that what the command line prints can be read by a test."""
 
 settings.register_profile(
     "tests", deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
 )
 settings.load_profile("tests")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them."""
+    made_by = hashlib.sha256(f"{version('eclipse-sumo')} {version('numpy')}".encode())
+    for source in sorted((ROOT / "sumo_nets").rglob("*.py")):
+        made_by.update(source.read_bytes())
+    os.environ["COSIM_CACHE"] = str(ROOT / ".pytest_cache" / f"nets-{made_by.hexdigest()[:12]}")
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in WIDE.items():
+            patch.setenv(name, value)
+        importlib.import_module("cosim.cli")  # consoles look at the environment once, when they are made
+
+
+class Said(NamedTuple):
+    """What a command printed, and its exit code."""
+
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+Cosim = Callable[..., Said]
+"""cosim(*words, cwd=folder)."""
+
+
+@pytest.fixture
+def cosim() -> Cosim:
+    """The command line by its own entry point, in this process: nothing is loaded anew, the rest is as for a user."""
+    return _here
+
+
+@pytest.fixture(scope="session")
+def fresh_cosim() -> Cosim:
+    """The command line in a process of its own."""
+    return _in_a_process
+
+
+def _in_a_process(*words: str, cwd: Path | None = None) -> Said:
+    command = [sys.executable, "-m", "cosim", *words]
+    done = subprocess.run(
+        command, cwd=cwd, env=os.environ | WIDE, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    return Said(done.returncode, done.stdout, done.stderr)
+
+
+def _here(*words: str, cwd: Path | None = None) -> Said:
+    from cosim.__main__ import main
+
+    out, err = io.StringIO(), io.StringIO()
+    with _as_a_program(words, cwd or Path.cwd()), redirect_stdout(out), redirect_stderr(err):
+        try:
+            main()
+            code = 0
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+    return Said(code, out.getvalue(), err.getvalue())
+
+
+@contextmanager
+def _as_a_program(words: tuple[str, ...], folder: Path) -> Iterator[None]:
+    """In a folder, with arguments; afterwards nothing is left of the program: no module of the folder, no signal."""
+    before = Path.cwd(), sys.argv, [*sys.path], {*sys.modules}, signal.getsignal(signal.SIGTERM)
+    os.chdir(folder)
+    sys.argv = ["cosim", *words]
+    try:
+        yield
+    finally:
+        os.chdir(before[0])
+        sys.argv, sys.path[:] = before[1], before[2]
+        for name in {*sys.modules} - before[3]:
+            source = getattr(sys.modules[name], "__file__", None)
+            if source and Path(source).is_relative_to(folder):
+                del sys.modules[name]
+        signal.signal(signal.SIGTERM, before[4])

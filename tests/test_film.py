@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import av
@@ -23,18 +20,13 @@ from cosim.report.video import Video
 from cosim.scenario import City, CrowdSpec, Suite, write_suite
 from cosim.walks import WalkGraph
 from scenarios.film import Cut, robot_eye
+from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
 
 
-def cosim(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "cosim", *words]
-    environment = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=120, env=environment)
-
-
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
     from scenarios.assemble import place
     from scenarios.long_horizon import build
@@ -44,15 +36,15 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     _, street_map = place(city)
     whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
     short = msgspec.structs.replace(
-        whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=4.0, robot="courier"
+        whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
-    done = cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
+    done = fresh_cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
 
 
-def test_a_film_shows_the_seconds_asked_for(desk: Path) -> None:
+def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim) -> None:
     """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play."""
     words = ("film", "run", "t-0", "--from", "1", "--to", "2", "--size", "320x180", "-o", "film.mp4")
     done = cosim(*words, cwd=desk)
@@ -64,7 +56,7 @@ def test_a_film_shows_the_seconds_asked_for(desk: Path) -> None:
     assert not list(desk.glob("*.part"))
 
 
-def test_a_film_is_from_above_or_from_the_robot(desk: Path) -> None:
+def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
     """--view puts another picture beside the same map, over the same bar."""
     seen = []
     for view in ("above", "robot"):
@@ -89,7 +81,7 @@ def test_the_robots_camera_sees_no_farther_aside_in_a_film(size: tuple[int, int]
         assert aside > 0.5
 
 
-def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
+def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None:
     """A film of another episode than the recorded one is no film of it: an error, and no file."""
     path = desk / "run" / "episodes" / "t-0" / "record.json"
     kept = path.read_bytes()
@@ -120,13 +112,13 @@ def test_a_record_that_does_not_replay_is_told(desk: Path) -> None:
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
     ],
 )
-def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, words: tuple[str, ...], told: str) -> None:
+def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, cosim: Cosim, words: tuple[str, ...], told: str) -> None:
     """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
     done = cosim(*words, cwd=desk)
     assert done.returncode == (3 if "written" in told else 2) and told in done.stderr and "Traceback" not in done.stderr
 
 
-def test_a_look_is_a_picture_of_its_moment(desk: Path) -> None:
+def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
     """From the robot or from above: a picture of the size asked for, with something in it."""
     seen = {}
     for name, words in {
