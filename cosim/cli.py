@@ -21,6 +21,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_on
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
+from cosim.cli_progress import doing
 from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError
 
 app = typer.Typer(
@@ -253,7 +254,8 @@ def show(
     print_episode(out, record)
     if record.status == "done":
         path = picture or folder / "episodes" / episode / "above.png"
-        draw_episode(folder, episode, path)
+        with doing(f"drawing {episode}"):
+            draw_episode(folder, episode, path)
         out.print(f"Picture: {path}", soft_wrap=True)
 
 

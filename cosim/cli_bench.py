@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
+from cosim.cli_progress import doing
 from cosim.errors import unknown
 
 out = Console()
-err = Console(stderr=True)
 
 
 def bench(
@@ -53,9 +53,9 @@ def bench(
     from scenarios import bench_street
     from scenarios.bench import PARTS, measure, spread
 
-    with err.status("measuring ...") as status:
-        report = measure(rounds, lambda words: status.update(f"measuring: {words}"))
-        streets = bench_street.measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    with doing("measuring") as tell:
+        report = measure(rounds, lambda words: tell(f"measuring: {words}"))
+        streets = bench_street.measure(rounds, lambda words: tell(f"measuring: {words}"))
     table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
     rows: list[tuple[str, list[float], str]] = [
         ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
@@ -97,8 +97,8 @@ def bench_cameras(rounds: int) -> None:
 
     drawn_by = renderer_of(chosen("auto"))
     on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by
-    with err.status("measuring ...") as status:
-        found = measure(rounds, lambda words: status.update(f"measuring: {words}"))
+    with doing("measuring") as tell:
+        found = measure(rounds, lambda words: tell(f"measuring: {words}"))
     head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
     table = Table(head, "frames/s", "spread", "target")
     for figure in FIGURES:

@@ -14,6 +14,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Column, Table
 
 from cosim.box import box_of
+from cosim.cli_progress import doing
 from cosim.errors import SOME_CRASHED
 
 if TYPE_CHECKING:
@@ -71,7 +72,9 @@ def make(
     from cosim.scenario import City
     from sumo_nets.store import write_city
 
-    made = write_city(City(seed=seed, size_m=size, style=style), folder)
+    city = City(seed=seed, size_m=size, style=style)
+    with doing(f"building {city.name}"):
+        made = write_city(city, folder)
     out.print(f"{folder}: {made.name}, net {made.net_hash}", soft_wrap=True, highlight=False)
 
 
@@ -116,7 +119,11 @@ def draw(
     from sumo_nets.store import city_net
 
     part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
-    write_png(_picture(street_map_of(city_net(City(seed=seed, size_m=size, style=style))), part), picture)
+    city = City(seed=seed, size_m=size, style=style)
+    with doing(f"building {city.name}") as tell:
+        street_map = street_map_of(city_net(city))
+        tell("drawing")
+        write_png(_picture(street_map, part), picture)
     out.print(f"Picture: {picture}", soft_wrap=True)
 
 

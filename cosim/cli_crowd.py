@@ -10,8 +10,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from cosim.cli_progress import doing
+
 out = Console()
-err = Console(stderr=True)
 
 LIGHTS = (
     ("persons entered at red", "persons entered signalised crossings", "0"),
@@ -46,8 +47,8 @@ def bench_crowd(cities: int, minutes: float, residents: int, groups: float, elde
     from scenarios.group_tally import APART_M
 
     spec = CrowdSpec(residents=residents, groups=groups, elderly=elderly, children=children)
-    with err.status("watching ...") as status:
-        found = watch_all(cities, minutes, spec, lambda words: status.update(f"watching: {words}"))
+    with doing("watching the crowd") as tell:
+        found = watch_all(cities, minutes, spec, lambda words: tell(f"watching the crowd: {words}"))
     counts = summed(one.counts for one in found)
     total_min = sum(one.minutes for one in found)
     places = f"{len(found)} cities, {total_min:.0f} min, {sum(f.crossings for f in found)} signalised crossings entered"
@@ -79,8 +80,8 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     from scenarios.bench_crossings import cross_all, crossings_entered
     from scenarios.bench_crowd import summed
 
-    with err.status("driving ...") as status:
-        rows = cross_all(crossings, cities, policy, jobs, lambda words: status.update(f"driving: {words}"))
+    with doing("drawing crossings") as tell:
+        rows = cross_all(crossings, cities, policy, jobs, lambda words: tell(f"driving: {words}"))
     places = f"cities: {len({row.city for row in rows})}, minutes: {sum(row.minutes for row in rows):.0f}"
     robot = Table(policy, "", f"signalised crossings: {len(rows)}, {places}")
     waited = [row.waited_s for row in rows if row.waited_s > 0.0]
@@ -123,9 +124,9 @@ def compare_one(
     from cosim.delay import NEAR_M
     from scenarios.replay import check, compared, recorded
 
-    with err.status(f"{episode}, with and without its robot ..."):
+    with doing(f"reading {episode}") as tell:
         told = recorded(folder, episode)
-        state_hash, found = compared(told)
+        state_hash, found = compared(told, tell)
     check(folder, told, state_hash)
     table = Table(episode, f"delay, s: within {NEAR_M:g} m", "of", "delay, s: all", "of", "not comparable")
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):

@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
+from cosim.cli_progress import doing
 from cosim.errors import UsageError, unknown
 
 if TYPE_CHECKING:
@@ -62,8 +63,8 @@ def look(
     pixels = size_of(size)
     whole = with_crowd(shipped(suite), residents=residents, groups=groups, elderly=elderly, children=children)
     (one,) = chosen(whole, [scenario])
-    with err.status(f"driving to {at:g} s ..." if at else "setting up ..."):
-        image, time_s = look(one, policy, at, picked, pixels, camera_here(camera))
+    with doing("choosing the camera") as tell:
+        image, time_s = look(one, policy, at, picked, pixels, camera_here(camera), tell)
     save(image, output)
     out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
 

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from cosim.cli_progress import doing
 from cosim.errors import INTERRUPTED, WRONG_USE, EngineError, UsageError, unknown
 
 out = Console()
@@ -95,9 +96,9 @@ def replay(
     """Run a finished episode again from its record, injections included, and compare the state hash."""
     from scenarios.replay import check, recorded, replayed
 
-    with err.status(f"replaying {episode} ..."):
+    with doing(f"reading {episode}") as tell:
         told = recorded(folder, episode)
-        again = replayed(told)
+        again = replayed(told, tell=tell)
     check(folder, told, again)
     out.print(f"{episode}: state hash {again}, as recorded", highlight=False)
 

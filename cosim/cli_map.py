@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cosim.box import box_of
+from cosim.cli_progress import doing
 from cosim.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 
 if TYPE_CHECKING:
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 
 map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Cities of the real world: SUMO and OSM.")
 out = Console()
-err = Console(stderr=True)
 
 
 @map_app.command(
@@ -49,8 +50,9 @@ def import_(
     from sumo_nets.mapstore import checked_map, import_map
 
     options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
-    with err.status(f"importing {file.name} ..."):
+    with doing(f"converting {file.name}") as tell:
         about = import_map(file, name, options)
+        tell(f"checking {about.name}")
         _, check, about = checked_map(about.name)
     print_check(check, about)
     out.print(f"Kept as '{about.name}': see it with `cosim map check {about.name} -o map.png`.", soft_wrap=True)
@@ -74,11 +76,13 @@ def check(
     part = None if zoom is None else box_of("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
-    street_map, found, about = _look_up(place)
-    if picture is not None:
-        from cosim.report.mapsheet import draw_map, write_png
+    with doing(f"checking {place}") as tell:
+        street_map, found, about = _look_up(place)
+        if picture is not None:
+            from cosim.report.mapsheet import draw_map, write_png
 
-        write_png(draw_map(street_map, found, part), picture)
+            tell("drawing")
+            write_png(draw_map(street_map, found, part), picture)
     if as_json:
         report = {"usable": found.usable, "check": found, "about": about}
         typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
@@ -109,8 +113,8 @@ def endure(
     table = Table("map", "simulated min", "persons", "vehicles", "wall s", "ended by", box=box.SIMPLE_HEAD)
     failed = False
     for name in maps:
-        with err.status(f"{minutes:g} min on {name} ..."):
-            done = endured_on(CityMap(map=name), seed, minutes)
+        with doing(f"{minutes:g} min on {name}") as tell:
+            done = endured_on(CityMap(map=name), seed, minutes, partial(tell, f"{minutes:g} min on {name}"))
         failed |= bool(done.reason)
         simulated_min = Clock().time_s(done.ticks) / 60.0
         cells = (f"{simulated_min:.1f}", f"{done.persons:.0f}", f"{done.vehicles:.0f}", f"{done.wall_s:.0f}")

@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from multiprocessing.connection import Connection
 
 import msgspec
@@ -60,7 +60,7 @@ class Endured(msgspec.Struct, frozen=True, kw_only=True):
     reason: str = ""
 
 
-def endure(where: Place, seed: int, minutes: float = 10.0) -> Endured:
+def endure(where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float], None] = lambda _: None) -> Endured:
     """Simulate a place in a process of its own. Whatever goes wrong there becomes the reason, not an exception."""
     context = multiprocessing.get_context("spawn")
     mine, theirs = context.Pipe(duplex=False)
@@ -73,6 +73,7 @@ def endure(where: Place, seed: int, minutes: float = 10.0) -> Endured:
     try:
         while mine.poll(HANG_S):
             last = msgspec.json.decode(mine.recv_bytes(), type=Endured)
+            tell(last.ticks / ticks)
         process.kill()
         reason = f"SUMO showed no sign of life for {HANG_S:g} s"
     except (EOFError, ConnectionResetError):

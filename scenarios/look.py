@@ -18,8 +18,9 @@ from cosim.report.legend import Image
 from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.step import Step
+from cosim.telling import Tell, untold
 from physics.cameras import CameraChoice
-from scenarios.assemble import staged
+from scenarios.assemble import place, staged
 from scenarios.run import drive
 
 View = Literal["robot", "follow", "above"]
@@ -41,21 +42,32 @@ class _Reached(Exception):
 
 
 def look(
-    scenario: Scenario, policy: str, at_s: float, view: View, size: tuple[int, int], camera_name: CameraChoice = "auto"
+    scenario: Scenario,
+    policy: str,
+    at_s: float,
+    view: View,
+    size: tuple[int, int],
+    camera_name: CameraChoice = "auto",
+    tell: Tell = untold,
 ) -> tuple[Image, float]:
     """((H, W, 3) uint8 RGB, seconds): the picture `at_s` seconds into an episode, or at its end if that comes first.
 
-    policy: who drives until then. size: width, height.
+    policy: who drives until then. size: width, height. tell: is told what is being done.
     """
     driver = load_policy(policy)
     last = Clock().ticks(at_s)
     spec = CameraSpec(*size) if driver.manifest.camera is None else CameraSpec(*size, driver.manifest.camera.fov_deg)
+    tell(f"reading the street map of {scenario.place.name}")
+    place(scenario.place)
+    tell("starting SUMO, PyBullet and the camera")
     with staged(scenario, driver, camera_name) as stage, stage.eyes(spec) as camera:
         seen: list[Step] = []
 
         def watch(step: Step, _: Verdict) -> None:
             seen[:] = [step]
-            if step.tick >= last:
+            if step.tick < last:
+                tell(f"simulating to {at_s:g} s", step.tick / last)
+            else:
                 raise _Reached(step.robot, step.street)
 
         try:
@@ -63,6 +75,7 @@ def look(
             robot, street = seen[0].motion.robot, seen[0].street_after
         except _Reached as moment:
             robot, street = moment.robot, moment.street
+        tell("drawing")
         if view == "robot":
             return camera.render(robot, street).rgb, Clock().time_s(street.tick)
         eye, target = behind(robot) if view == "follow" else over(robot)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 from cosim.errors import RunError, unknown
 from cosim.policies.replay import Replay
 from cosim.record import Log, Record, begun
+from cosim.referee import Verdict
 from cosim.runfolder import read_records
 from cosim.scenario import Scenario, read_suite
+from cosim.step import Step
+from cosim.telling import Tell, untold
 from cosim.versions import versions
 from scenarios.assemble import staged
 from scenarios.counterfactual import Beside, Compared
@@ -38,22 +42,29 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
     return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
 
 
-def replayed(told: Recorded, *watches: Watch) -> str:
+def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:
     """Run it again; the state hash that comes out."""
-    return _again(told, *watches)[0]
+    return _again(told, tell, *watches)[0]
 
 
-def compared(told: Recorded) -> tuple[str, Compared]:
+def compared(told: Recorded, tell: Tell = untold) -> tuple[str, Compared]:
     """Run it again, then its street without the robot; the state hash, and what the robot cost the others."""
     beside = Beside()
-    state_hash, entrances = _again(told, beside.watch)
-    return state_hash, beside.compared(told.scenario, entrances)
+    state_hash, entrances = _again(told, tell, beside.watch)
+    return state_hash, beside.compared(told.scenario, entrances, partial(tell, "the street without the robot"))
 
 
-def _again(told: Recorded, *watches: Watch) -> tuple[str, Entrances]:
+def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]:
     driver = Replay(told.log.command)
+
+    def watch(step: Step, _: Verdict) -> None:
+        tell(f"replaying {told.scenario.id}", step.tick / len(told.log))
+
+    tell("starting SUMO and PyBullet")
     with staged(told.scenario, driver, script=told.record.injections) as stage:
-        record, _ = drive(begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, *watches)
+        record, _ = drive(
+            begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, watch, *watches
+        )
     return record.state_hash, stage.entrances
 
 

@@ -119,7 +119,8 @@ def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, cosim: Cosim, wor
 
 
 def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
-    """From the robot or from above: a picture of the size asked for, with something in it."""
+    """From the robot or from above: a picture of the size asked for, with something in it; what is done meanwhile is
+    said."""
     seen = {}
     for name, words in {
         "start": ("--at", "0"),
@@ -127,6 +128,10 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
     }.items():
         done = cosim("look", "t-0", "--suite", "tiny.json", *words, "--size", "160x90", "-o", f"{name}.png", cwd=desk)
         assert done.returncode == 0, done.stderr
+        driven = ["simulating to 1 s"] if name == "above" else []
+        stages = ["choosing the camera", "reading the street map", "starting SUMO", *driven, "drawing"]
+        said = done.stderr.splitlines()
+        assert len(said) == len(stages) and all(map(str.startswith, said, stages))
         seen[name] = cv2.imread(str(desk / f"{name}.png"))
         assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
     assert (seen["start"] != seen["above"]).mean() > 0.5

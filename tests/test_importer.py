@@ -344,6 +344,7 @@ def test_command_line(tmp_path: Path) -> None:
 
     done = cosim("import", source, "--name", "town")
     assert done.returncode == 0 and "long-horizon scenarios possible" in done.stdout, done.stderr
+    assert "converting " in done.stderr and "checking town ..." in done.stderr
     done = cosim("check", "town", "--json", "-o", picture, "--zoom", "0,0,100,100")
     assert done.returncode == 0 and json.loads(done.stdout)["check"]["corners"] > 10
     assert picture.read_bytes().startswith(b"\x89PNG")

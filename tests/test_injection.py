@@ -319,6 +319,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
     replayed = air.cosim("replay", "run", "t-0")
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
+    assert "replaying t-0 ..." in replayed.stderr
     without = json.dumps(record | {"injections": []})
     (tmp_path / "run" / "episodes" / "t-0" / "record.json").write_text(without)
     differs = air.cosim("replay", "run", "t-0")

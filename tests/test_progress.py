@@ -1,0 +1,29 @@
+"""What is said while something takes its time."""
+
+from __future__ import annotations
+
+import io
+
+from rich.console import Console
+
+from cosim.cli_progress import doing
+
+
+def test_a_log_gets_one_line_for_each_stage() -> None:
+    """Where standard error is no terminal nothing moves and nothing is repeated: a line when a stage begins."""
+    said = io.StringIO()
+    with doing("reading [the] city", Console(file=said, width=80)) as tell:
+        for share in (0.0, 0.5, 1.0):
+            tell("simulating to 20 s", share)
+        tell("drawing")
+    assert said.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
+
+
+def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
+    """In a terminal the stage stands with its share and the time; at the end the line is taken away."""
+    said = io.StringIO()
+    console = Console(file=said, width=80, force_terminal=True, legacy_windows=False, _environ={"TERM": "xterm"})
+    with doing("reading [the] city", console) as tell:
+        tell("simulating to 20 s", 0.5)
+    assert "simulating to 20 s: 50 %" in said.getvalue() and "0:00:00" in said.getvalue()
+    assert said.getvalue().endswith("\x1b[2K") or "\x1b[1A\x1b[2K" in said.getvalue()
