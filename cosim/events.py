@@ -6,14 +6,15 @@ started again in the middle of an episode without a trace in the result.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Iterator, Mapping
 from types import MappingProxyType
-from typing import Final, Literal
+from typing import Annotated, Final, Literal
 
 import msgspec
 
-from cosim.errors import SpecError
-from cosim.state import Doing
+from cosim.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
+from cosim.state import PERSON_RADIUS_M, Doing
 
 Kind = Literal["obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"]
 
@@ -30,7 +31,7 @@ GUEST: Final = "ei-"
 """What the ids of injected pedestrians begin with."""
 
 
-class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Event(Ranged, frozen=True, kw_only=True):
     """One event: a pedestrian or a group on the way.
 
     x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
@@ -41,32 +42,35 @@ class Event(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tru
 
     id: str
     kind: Kind
-    x_m: float
-    y_m: float
-    heading_rad: float
-    route_s_m: float
-    half_width_m: float
-    speed_mps: float = 1.3
-    hold_s: float = 20.0
+    x_m: Annotated[float, WHERE_M]
+    y_m: Annotated[float, WHERE_M]
+    heading_rad: Annotated[float, HEADING_RAD]
+    route_s_m: Annotated[float, ALONG_M]
+    half_width_m: Annotated[float, Within(PERSON_RADIUS_M, 50, above=True)]
+    speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
+    hold_s: Annotated[float, Within(0, 3600)] = 20.0
     side: Literal[-1, 1] = 1
     people: int = 1
-    half_length_m: float = 0.0
+    half_length_m: Annotated[float, Within(0, 50)] = 0.0
 
-    def __post_init__(self) -> None:
-        if not self.id.startswith("e"):
-            raise SpecError(f"event id '{self.id}': ids of event pedestrians start with 'e'")
+    @property
+    def called(self) -> str:
+        return f"event {shown(self.id)}: "
+
+    def contradictions(self) -> Iterator[str]:
+        if not re.fullmatch(r"e[A-Za-z0-9_-]{0,31}", self.id):
+            yield (
+                f"event id {shown(self.id)}: ids of event pedestrians start with 'e', "
+                "and at most 31 of A-Z a-z 0-9 _ - follow"
+            )
         if self.id.startswith(GUEST):
-            raise SpecError(f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians")
-        if not 0.0 < self.speed_mps <= 3.0:
-            raise SpecError(f"event '{self.id}': speed_mps must be in (0, 3], not {self.speed_mps}")
-        if not self.half_width_m > 0.3:
-            raise SpecError(f"event '{self.id}': half_width_m must exceed a person's 0.3 m, not {self.half_width_m}")
+            yield f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians"
         fewest, most = GROUPS[self.kind]
         if not fewest <= self.people <= most:
             allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-            raise SpecError(f"event '{self.id}': people of '{self.kind}' must be {allowed}, not {self.people}")
+            yield f"{self.called}people of '{self.kind}' must be {allowed}, not {shown(self.people)}"
         if (self.kind == "ped_crossing") != (self.half_length_m > 0.0):
-            raise SpecError(f"event '{self.id}': half_length_m is the crosswalk's: of 'ped_crossing', and of no other")
+            yield f"{self.called}half_length_m is the crosswalk's: of 'ped_crossing', and of no other"
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -6,33 +6,44 @@ A spec is complete: the same spec gives the same episode, bit for bit, in any pr
 from __future__ import annotations
 
 import hashlib
-import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Literal
 
 import msgspec
-from msgspec import inspect as info
+import numpy as np
 
 from cosim.errors import SpecError
 from cosim.events import Event
 from cosim.geometry import Polyline, Pose
+from cosim.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
+from cosim.specfile import read_spec_file
 
 SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
-_FOLDER_NAME = re.compile(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]{0,99}")
+SHORTEST_M = 1.0
+LONGEST_M = 20_000.0
+"""Of a reference route."""
+SLACK_M = 0.01
+EVENT_BEYOND_M = 60.0
+"""Who comes towards the robot may start from beyond the goal, so far."""
+SHARE = Within(0, 1, words="must be a share in {range}, not {value}")
+NAME = Text(200)
+FOLDER = Named("a folder")
 
 
-class _Uneven(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Uneven(Ranged, frozen=True, kw_only=True):
     """A place whose ground may be uneven. roughness: from 0 (flat) to 1; a spec of flat ground does not mention it,
     so that it keeps the hash it had before there was uneven ground."""
 
-    roughness: float | msgspec.UnsetType = msgspec.UNSET
+    roughness: Annotated[
+        float | msgspec.UnsetType, Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
+    ] = msgspec.UNSET
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.unevenness <= 1.0:
-            raise SpecError(f"roughness is {self.unevenness:g}, but it lies between 0 (flat) and 1")
+        super().__post_init__()
         if self.roughness == 0.0:
             msgspec.structs.force_setattr(self, "roughness", msgspec.UNSET)
 
@@ -42,13 +53,22 @@ class _Uneven(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=T
         return 0.0 if isinstance(self.roughness, msgspec.UnsetType) else self.roughness
 
 
-class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
-    """A procedural city. net_hash: content hash of the street net the scenario was made on."""
+CITY_SIZE_M = Within(200, 4000)
+"""In a smaller square there is no room for two blocks."""
 
-    seed: int
-    size_m: float = 2000.0
-    style: str = "mixed"
-    net_hash: str = ""
+
+class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
+    """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the scenario was made
+    on."""
+
+    seed: Annotated[int, SEED]
+    size_m: Annotated[float, CITY_SIZE_M] = 2000.0
+    style: Annotated[str, Named("a style")] = "mixed"
+    net_hash: Annotated[str, NAME] = ""
+
+    def contradictions(self) -> Iterator[str]:
+        if round(self.size_m, 2) != self.size_m:
+            yield f"city size_m must be in whole centimetres, not {self.size_m}"
 
     @property
     def name(self) -> str:
@@ -58,9 +78,9 @@ class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
 class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
     """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
 
-    map: str
-    seed: int = 0
-    net_hash: str = ""
+    map: Annotated[str, NAME]
+    seed: Annotated[int, SEED] = 0
+    net_hash: Annotated[str, NAME] = ""
 
     @property
     def name(self) -> str:
@@ -70,38 +90,45 @@ class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
 Place = City | CityMap
 
 
-class Barrier(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Barrier(Ranged, frozen=True, kw_only=True):
     """A fence across a way. heading_rad: along the way it closes; length_m: across it.
 
     strip, end: the port of the walking graph that it closes.
     """
 
-    x_m: float
-    y_m: float
-    heading_rad: float
-    length_m: float
-    strip: str
+    x_m: Annotated[float, WHERE_M]
+    y_m: Annotated[float, WHERE_M]
+    heading_rad: Annotated[float, HEADING_RAD]
+    length_m: Annotated[float, Within(0.1, 200)]
+    strip: Annotated[str, NAME]
     end: Literal[0, 1]
-    thickness_m: float = 0.12
-    height_m: float = 1.0
+    thickness_m: Annotated[float, Within(0.01, 2)] = 0.12
+    height_m: Annotated[float, Within(0.1, 5)] = 1.0
 
 
-class RouteCrossing(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class RouteCrossing(Ranged, frozen=True, kw_only=True):
     """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
 
-    id: str
-    enter_s_m: float
-    leave_s_m: float
+    id: Annotated[str, NAME]
+    enter_s_m: Annotated[float, ALONG_M]
+    leave_s_m: Annotated[float, ALONG_M]
     signalised: bool
+
+    @property
+    def called(self) -> str:
+        return f"crossing {shown(self.id)}: "
+
+    def contradictions(self) -> Iterator[str]:
+        if self.enter_s_m > self.leave_s_m:
+            yield f"{self.called}enter_s_m {self.enter_s_m} comes after leave_s_m {self.leave_s_m}"
 
 
 DEFAULT_PERSONS = 50
 MOST_PER_1000_M2 = 150.0
 """Denser crowds have no room to enter 1.5 m apart."""
-MOST_RESIDENTS = 60
 
 
-class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class CrowdSpec(Ranged, frozen=True, kw_only=True):
     """The street life around the robot: persons and vehicles kept within radius_m of it.
 
     density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
@@ -111,47 +138,38 @@ class CrowdSpec(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     slower than others. A child walks in a group with an adult, at the child's pace.
     """
 
-    persons: int = DEFAULT_PERSONS
-    radius_m: float = 80.0
-    vehicles: int = 20
-    density: float | msgspec.UnsetType = msgspec.UNSET
-    residents: int = 0
-    groups: float = 0.0
-    elderly: float = 0.0
-    children: float = 0.0
+    persons: Annotated[int, Within(0, 1000)] = DEFAULT_PERSONS
+    radius_m: Annotated[float, Within(20, 500)] = 80.0
+    vehicles: Annotated[int, Within(0, 200)] = 20
+    density: Annotated[
+        float | msgspec.UnsetType,
+        Within(0, MOST_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
+    ] = msgspec.UNSET
+    residents: Annotated[int, Within(0, 60)] = 0
+    groups: Annotated[float, SHARE] = 0.0
+    elderly: Annotated[float, SHARE] = 0.0
+    children: Annotated[float, SHARE] = 0.0
 
-    def __post_init__(self) -> None:
-        self._check_shares()
-        if not 0 <= self.residents <= MOST_RESIDENTS:
-            raise SpecError(f"crowd residents must be in [0, {MOST_RESIDENTS}], not {self.residents}")
-        if self.persons < 0 or self.vehicles < 0:
-            raise SpecError(f"persons and vehicles cannot be negative: {self.persons}, {self.vehicles}")
-        if not 20.0 <= self.radius_m <= 500.0:
-            raise SpecError(f"crowd radius_m must be in [20, 500], not {self.radius_m}")
-        if isinstance(self.density, msgspec.UnsetType):
-            return
-        if not 0.0 <= self.density <= MOST_PER_1000_M2:
-            raise SpecError(f"crowd density must be in [0, {MOST_PER_1000_M2:g}] per 1000 m2, not {self.density}")
-        if self.persons != DEFAULT_PERSONS:
-            raise SpecError(f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both")
+    @property
+    def called(self) -> str:
+        return "crowd "
 
-    def _check_shares(self) -> None:
-        for field in ("groups", "elderly", "children"):
-            if not 0.0 <= getattr(self, field) <= 1.0:
-                raise SpecError(f"crowd {field} must be a share in [0, 1], not {getattr(self, field)}")
+    def contradictions(self) -> Iterator[str]:
         if 2.0 * self.children > self.groups + 1e-9:
-            raise SpecError(
+            yield (
                 f"crowd children must be in [0, groups / 2] = [0, {self.groups / 2:g}], not {self.children}: "
                 f"each walks in a group with an adult; give groups of {2.0 * self.children:g} or more"
             )
         if self.elderly + 2.0 * self.children > 1.0 + 1e-9:
-            raise SpecError(
+            yield (
                 f"crowd elderly must be in [0, 1 - 2 children] = [0, {1.0 - 2.0 * self.children:g}], "
                 f"not {self.elderly}: children walk with adults who are not elderly"
             )
+        if not isinstance(self.density, msgspec.UnsetType) and self.persons != DEFAULT_PERSONS:
+            yield f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both"
 
 
-class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, forbid_unknown_fields=True):
+class Light(Ranged, frozen=True, kw_only=True, omit_defaults=True):
     """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
 
     hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
@@ -159,65 +177,73 @@ class Light(msgspec.Struct, frozen=True, kw_only=True, omit_defaults=True, forbi
     darker (-) than the camera would choose. hdri: path of an equirectangular Radiance .hdr that replaces sky and sun.
     """
 
-    hour: float = 13.0
-    day_of_year: int = 172
-    latitude_deg: float = 48.0
-    cloud_cover: float = 0.25
-    fog_m: float | None = None
-    exposure_ev: float = 0.0
+    hour: Annotated[float, Within(0, 24)] = 13.0
+    day_of_year: Annotated[int, Within(1, 366)] = 172
+    latitude_deg: Annotated[float, Within(-90, 90)] = 48.0
+    cloud_cover: Annotated[float, Within(0, 1)] = 0.25
+    fog_m: Annotated[float | None, Within(10, 50_000)] = None
+    exposure_ev: Annotated[float, Within(-4, 4)] = 0.0
     shadows: bool = True
-    hdri: str = ""
+    hdri: Annotated[str, Text(1000)] = ""
 
-    def __post_init__(self) -> None:
-        ranges = {
-            "hour": (0.0, 24.0), "day_of_year": (1, 366), "latitude_deg": (-90.0, 90.0), "cloud_cover": (0.0, 1.0),
-            "fog_m": (10.0, 50_000.0), "exposure_ev": (-4.0, 4.0),
-        }  # fmt: skip
-        for field, (low, high) in ranges.items():
-            value = getattr(self, field)
-            if value is not None and not low <= value <= high:
-                raise SpecError(f"light {field} must be in [{low:g}, {high:g}], not {value}")
+    def contradictions(self) -> Iterator[str]:
         if self.hdri and not self.hdri.lower().endswith(".hdr"):
-            raise SpecError(f"light hdri must be a Radiance .hdr file, not '{self.hdri}'")
+            yield f"light hdri must be a Radiance .hdr file, not {shown(self.hdri)}"
 
 
-class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Scenario(Ranged, frozen=True, kw_only=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
 
-    id: str
-    suite: str
+    id: Annotated[str, FOLDER]
+    suite: Annotated[str, NAME]
     place: Place
-    seed: int
+    seed: Annotated[int, SEED]
     start: tuple[float, float, float]
     goal: tuple[float, float]
-    route: tuple[tuple[float, float], ...]
-    crossings: tuple[RouteCrossing, ...] = ()
-    barriers: tuple[Barrier, ...] = ()
-    events: tuple[Event, ...] = ()
+    route: Annotated[tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)]
+    crossings: Annotated[tuple[RouteCrossing, ...], Counted(0, 1000)] = ()
+    barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
+    events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
     crowd: CrowdSpec = CrowdSpec()
-    robot: str = "courier"
-    goal_radius_m: float = 1.0
-    time_limit_s: float = 300.0
+    robot: Annotated[str, NAME] = "courier"
+    goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
+    time_limit_s: Annotated[float, Within(0.1, 100_000)] = 300.0
     ends_on_failure: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
     light: Light = Light()
     schema: int = SCHEMA
 
-    def __post_init__(self) -> None:
-        if not _FOLDER_NAME.fullmatch(self.id):
-            raise SpecError(f"scenario id '{self.id}' cannot name a folder: no '/', no '.' in front, 1 to 100 letters")
+    @property
+    def called(self) -> str:
+        return "scenario " if FOLDER.refusal("id", self.id) else f"scenario '{self.id}': "
+
+    def contradictions(self) -> Iterator[str]:
         if self.schema != SCHEMA:
-            raise SpecError(f"scenario '{self.id}' has schema {self.schema}; this version reads {SCHEMA}")
+            yield f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads {SCHEMA}"
         if len(self.route) < 2:
-            raise SpecError(f"scenario '{self.id}': route needs two points or more")
+            yield f"{self.called}route needs two points or more"
+            return
         for field, (x, y), end in (("start", self.start[:2], self.route[0]), ("goal", self.goal, self.route[-1])):
-            if abs(x - end[0]) + abs(y - end[1]) > 1e-6:
-                raise SpecError(f"scenario '{self.id}': {field} {(x, y)} is not the route's end {end}")
-        if not self.goal_radius_m > 0 or not self.time_limit_s > 0:
-            raise SpecError(f"scenario '{self.id}': goal_radius_m and time_limit_s must be positive")
-        names = [name for event in self.events for name in event.names]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise SpecError(f"scenario '{self.id}': two events have a pedestrian '{twice[0]}': give one another id")
+            if not abs(x - end[0]) + abs(y - end[1]) <= 1e-6:
+                yield f"{self.called}{field} {(x, y)} is not the route's end {end}"
+        yield HEADING_RAD.refusal(f"{self.called}start's heading", self.start[2])
+        length_m = float(np.hypot(*np.diff(self.route, axis=0).T).sum())
+        yield Within(SHORTEST_M, LONGEST_M).refusal(f"{self.called}the length of the route, m,", length_m)
+        if length_m <= 2.0 * self.goal_radius_m:
+            yield (
+                f"{self.called}goal_radius_m must be less than half of the route's {length_m:g} m, "
+                f"not {self.goal_radius_m}"
+            )
+        places = [(crossing.called, "leave_s_m", crossing.leave_s_m, SLACK_M) for crossing in self.crossings]
+        places += [(event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events]
+        for called, field, s_m, beyond_m in places:
+            if s_m > length_m + beyond_m:
+                yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
+        if self.ends_at == "stop" and all(event.kind != "gesturing" for event in self.events):
+            yield f"{self.called}ends_at 'stop' needs an event 'gesturing': somebody to stop for"
+        names = Counter(name for event in self.events for name in event.names)
+        if twice := sorted(name for name, count in names.items() if count > 1):
+            yield f"{self.called}two events have a pedestrian '{twice[0]}': give one another id"
 
     @property
     def start_pose(self) -> Pose:
@@ -228,19 +254,19 @@ class Scenario(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
         return Polyline(self.route)
 
 
-class Suite(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Suite(Ranged, frozen=True, kw_only=True):
     """A named, versioned list of scenarios."""
 
-    name: str
-    version: str
+    name: Annotated[str, Named("a suite, and the folder of a run")]
+    version: Annotated[str, NAME]
     scenarios: tuple[Scenario, ...]
-    description: str = ""
+    description: Annotated[str, Text(10_000)] = ""
 
-    def __post_init__(self) -> None:
-        ids = [scenario.id for scenario in self.scenarios]
-        twice = sorted({i for i in ids if ids.count(i) > 1})
-        if twice:
-            raise SpecError(f"suite '{self.name}' lists scenarios twice: {', '.join(twice)}")
+    def contradictions(self) -> Iterator[str]:
+        times = Counter(scenario.id for scenario in self.scenarios)
+        if twice := sorted(name for name, count in times.items() if count > 1):
+            more = f" and {len(twice) - 5} more" if len(twice) > 5 else ""
+            yield f"suite '{self.name}' lists scenarios twice: {', '.join(twice[:5])}{more}"
 
     @property
     def content_hash(self) -> str:
@@ -275,35 +301,10 @@ def _canonical(spec: msgspec.Struct) -> bytes:
 
 def read_suite(path: Path) -> Suite:
     """The suite in a JSON file. Raises SpecError naming the file and the field, and what may stand there."""
-    try:
-        suite = msgspec.json.decode(path.read_bytes(), type=Suite)
-    except OSError as error:
-        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
-    except (msgspec.DecodeError, SpecError) as error:
-        raise SpecError(f"{path}: {error}{_choices(str(error))}") from error
+    suite = read_spec_file(path, Suite)
     if not suite.scenarios:
         raise SpecError(f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more")
     return suite
-
-
-def _choices(refusal: str) -> str:
-    """What msgspec does not say when it refuses a field or a name: the valid ones."""
-    found = re.fullmatch(r"(Object contains unknown field|Invalid enum value) .*?( - at `(.*)`)?", refusal)
-    if found is None:
-        return ""
-    here: Any = info.type_info(Suite)
-    for step in re.findall(r"\.(\w+)|(\[)", found[3] or ""):
-        here = _below(here, *step)
-    kinds = getattr(here, "types", (here,))
-    valid = getattr(here, "values", ()) or [f.encode_name for kind in kinds for f in getattr(kind, "fields", ())]
-    return f". Valid choices: {', '.join(dict.fromkeys(map(str, valid)))}" if valid else ""
-
-
-def _below(here: Any, field: str, item: str) -> Any:
-    """The msgspec type of a field of a struct, or of the items of a tuple."""
-    if item:
-        return getattr(here, "item_type", None)
-    return next((f.type for f in getattr(here, "fields", ()) if f.encode_name == field), None)
 
 
 def write_suite(suite: Suite, path: Path) -> None:

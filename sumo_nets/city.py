@@ -15,11 +15,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.errors import MapError, unknown
+from cosim.scenario import CITY_SIZE_M
 from sumo_nets.blocks import CLASSES
 from sumo_nets.draft import Cell, Draft, Link
 from sumo_nets.plan import CityPlan, plan_of
 
-SIZE_M = (200.0, 4000.0)
+SIZE_M = (CITY_SIZE_M.low, CITY_SIZE_M.high)
 """Smallest and largest city."""
 PITCH_M = (102.0, 126.0)
 MARGIN_M = 22.0

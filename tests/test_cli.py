@@ -327,7 +327,7 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, cos
         ({"route": [[0, 0]]}, "route needs two points"),
         ({"goal": [1.0, 2.0]}, "is not the route's end"),
         ({"time_limit_s": "long"}, "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`"),
-        ({"crowd": {"persons": -1}}, "persons and vehicles cannot be negative"),
+        ({"crowd": {"persons": -1}}, "crowd persons must be in [0, 1000], not -1"),
         ({"schema": 99}, "has schema 99"),
         (
             {"crowd": {"gruops": 0.4}},
