@@ -293,9 +293,11 @@ app.command(
     rich_help_panel=STEP_IN,
     epilog="Examples:  \n"
     '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
-    "`cosim inject @anna.json --env mine/lh-011-00`",
+    "`cosim inject @anna.json --env mine/lh-011-00 --wait 60`",
 )(inject)
-app.command(rich_help_panel=STEP_IN, epilog="Example:  \n`cosim listen robot --seconds 5`")(listen)
+app.command(
+    rich_help_panel=STEP_IN, epilog="Examples:  \n`cosim listen robot --seconds 5`  \n`cosim listen events --wait 60`"
+)(listen)
 app.command(
     rich_help_panel=STEP_IN,
     epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"

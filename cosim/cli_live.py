@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 
 from cosim.cli_progress import doing
-from cosim.errors import INTERRUPTED, WRONG_USE, EngineError, UsageError, unknown
+from cosim.errors import INTERRUPTED, WRONG_USE, CosimError, EngineError, UsageError, unknown
+
+if TYPE_CHECKING:
+    from bridge.session import Session
 
 out = Console()
 err = Console(stderr=True)
@@ -19,25 +23,29 @@ err = Console(stderr=True)
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
 SEARCH_S = 1.0
+PAUSE_S = 0.5
 LONGEST_WAIT_S = 240.0
 """For a director: an environment process that says nothing for much longer is taken to hang (`scenarios.pool`)."""
 
 Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
 Env = Annotated[str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")]
+Wait = Annotated[
+    float, typer.Option(min=0.0, max=1e6, help="Seconds to wait until it is on the air; by default it must be by now.")
+]
 
 
 def inject(
     message: Annotated[str, typer.Argument(help="The pedestrian as JSON, @FILE, or - for standard input.")],
     connect: Connect = DEFAULT,
     env: Env = None,
+    wait: Wait = 0.0,
 ) -> None:
     """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 2: refused."""
     from bridge.live import inject as send
-    from bridge.session import Session
 
     payload = _payload(message)
-    with Session.client(checked_endpoint(connect, "--connect")) as session:
-        below = _chosen(session, env)
+    session, below = found(connect, env, wait)
+    with session:
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
         err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
@@ -49,16 +57,15 @@ def listen(
     topic: Annotated[str, typer.Argument(help="clock, robot, crowd, signals or events.")] = "events",
     connect: Connect = DEFAULT,
     env: Env = None,
+    wait: Wait = 0.0,
     seconds: Annotated[float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")] = None,
 ) -> None:
     """Print what a running episode tells: a line of JSON each time. For `events` what happened before comes first."""
-    from bridge.session import Session
-
     topics = ("clock", "robot", "crowd", "signals", "events")
     if topic not in topics:
         raise unknown("topic", topic, topics)
-    with Session.client(checked_endpoint(connect, "--connect")) as session:
-        below = _chosen(session, env)
+    session, below = found(connect, env, wait)
+    with session:
         if topic == "events":
             print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
         session.listen(f"{below}/{topic}", lambda _, payload: print(payload.decode(), flush=True))
@@ -114,26 +121,53 @@ def _payload(message: str) -> bytes:
     return message.encode()
 
 
-def _chosen(session: object, env: str | None) -> str:
-    """What the keys of the episode that is meant begin with. Raises UsageError when that is not clear."""
+def found(connect: str, env: str | None, wait_s: float) -> tuple[Session, str]:
+    """A session at an endpoint, to be closed, and what the keys of the episode that is meant begin with.
+
+    Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on the air then,
+    UsageError when only others are, or when several are and none is named.
+    """
+    checked_endpoint(connect, "--connect")
+    meant = _meant(connect, env)
+    if isinstance(meant, tuple):
+        return meant
+    began = time.monotonic()
+    with doing(f"waiting up to {wait_s:g} s for {env or 'an episode'} at {connect}") if wait_s else nullcontext():
+        while isinstance(meant, CosimError):
+            left_s = began + wait_s - time.monotonic()
+            if left_s <= 0.0:
+                remedy = f"waited {wait_s:g} s" if wait_s else "--wait 60 waits until it is there"
+                raise type(meant)(f"{meant} ({remedy})")
+            time.sleep(min(PAUSE_S, left_s))
+            meant = _meant(connect, env)
+    err.print(f"{_name(meant[1])} is on the air after {time.monotonic() - began:.0f} s.", highlight=False)
+    return meant
+
+
+def _meant(connect: str, env: str | None) -> tuple[Session, str] | CosimError:
+    """An open session and the episode, or why there is none yet. Raises UsageError where waiting changes nothing."""
     from bridge import keys
     from bridge.session import Session
 
-    assert isinstance(session, Session)
-    found = sorted(key.removesuffix("/status") for key in session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S))
-    names = {"/".join(below.split("/")[1::2]): below for below in found}
-    if env is not None:
-        if env not in names:
-            raise unknown("running episode", env, names)
-        return names[env]
-    if not names:
-        raise EngineError(
-            "no episode is running there: start one with `cosim run ... --live ENDPOINT`; one just started takes some "
-            "seconds to be on the air"
-        )
-    if len(names) > 1:
+    try:
+        session = Session.client(connect)
+    except EngineError:
+        return EngineError(f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`")
+    statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)
+    names = {_name(below): below for below in sorted(key.removesuffix("/status") for key in statuses)}
+    if env in names or (env is None and len(names) == 1):
+        return session, names[env or next(iter(names))]
+    session.close()
+    if env is not None and names:
+        return unknown("running episode", env, names)
+    if names:
         raise UsageError(f"several episodes are running: choose one with --env: {', '.join(names)}")
-    return found[0]
+    return EngineError(f"a run is at {connect}, but none of its episodes is on the air: a new one takes some seconds")
+
+
+def _name(below: str) -> str:
+    """RUN/EPISODE, by what its keys begin with."""
+    return "/".join(below.split("/")[1::2])
 
 
 def checked_endpoint(endpoint: str, option: str) -> str:
