@@ -9,6 +9,7 @@ import msgspec
 import numpy as np
 import shapely
 
+from cosim import overlay
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import Lane, Port, StreetMap, Strip
 from cosim.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
@@ -204,7 +205,7 @@ def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
     polygons = np.array([s.polygon for s in sidewalks], dtype=object)
     tree = shapely.STRtree(roads)
     strip, lane = tree.query(polygons, predicate="intersects")
-    both = shapely.area(shapely.intersection(polygons[strip], tree.geometries[lane]))
+    both = shapely.area(overlay.intersection(polygons[strip], tree.geometries[lane]))
     covered = np.bincount(strip, weights=both, minlength=len(sidewalks))
     return np.minimum(covered / np.maximum(shapely.area(polygons), 1e-9), 1.0)
 

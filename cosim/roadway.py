@@ -16,6 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import shapely
 
+from cosim import overlay
 from cosim.geometry import Floats, Pose
 from cosim.state import PERSON_RADIUS_M, Street
 from cosim.step import Step
@@ -76,7 +77,7 @@ class Roadway:
             if strip is not None:
                 others = [s for s in self._map.near("strip", piece) if isinstance(s, Strip)]
                 crossings = [s.polygon for s in others if s.kind == "crossing"]
-                piece = shapely.difference(piece, shapely.union_all(crossings))
+                piece = overlay.difference(piece, overlay.union_all(crossings))
             shapely.prepare(piece)
             self._beside[edge] = piece
         return self._beside[edge]

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
+from cosim import overlay
 from cosim.errors import MapError
 from cosim.geometry import Floats
 from cosim.terrain import Elevation, Terrain
@@ -222,7 +223,7 @@ class StreetMap:
 def union_closed(polygons: Sequence[shapely.Geometry]) -> Polygon | MultiPolygon:
     """Union of polygons, with gaps up to 2 x SEAM_M between them closed."""
     grown = shapely.buffer(np.asarray(polygons, dtype=object), SEAM_M, join_style="mitre")
-    closed = shapely.buffer(shapely.union_all(grown), -SEAM_M, join_style="mitre")
+    closed = shapely.buffer(overlay.union_all(grown), -SEAM_M, join_style="mitre")
     # Slivers of foreign nets can make the mitred outline cross itself.
     if closed.is_valid:
         return closed

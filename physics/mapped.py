@@ -15,6 +15,7 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
+from cosim import overlay
 from cosim.streetmap import Feature, StreetMap
 from cosim.terrain import Terrain
 from physics.buildings import FACADES, Building, Wall
@@ -60,7 +61,7 @@ class MappedThings:
         tile = shapely.box(*square(key))
         found = []
         for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
-            parts = shapely.get_parts(shapely.intersection(self._houses[i].polygon, tile))
+            parts = shapely.get_parts(overlay.intersection(self._houses[i].polygon, tile))
             solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
             found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)

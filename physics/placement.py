@@ -16,6 +16,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from cosim import overlay
 from cosim.geometry import Polyline
 from cosim.streetmap import Lane, PieceKind, StreetMap, Strip
 from physics.buildings import Frontage
@@ -235,7 +236,7 @@ def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
         far = np.array([x, y]) - (0.5 * strip.width_m + strip.frontage_m) * aside
         way = shapely.Polygon([road - along, road + along, far + along, far - along])
         flares = shapely.buffer(shapely.LineString([road - along, road + along]), RAMP_M)
-        found.append(shapely.union(way, flares))
+        found.append(overlay.union(way, flares))
     return found
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from cosim import overlay
 from cosim.geometry import Floats, Polyline
 from cosim.streetmap import PieceKind, StreetMap, Strip, union_closed
 from cosim.terrain import Terrain
@@ -179,16 +180,16 @@ def _zones(street_map: StreetMap, reach: shapely.Polygon) -> tuple[dict[str, sha
 
     pavement = _union([*sidewalks, *corners], reach)
     zebras = _union([s.polygon for s in crossings], reach, closed=False)
-    crossing = shapely.difference(zebras, pavement)
-    road = shapely.difference(_union(roads, reach), shapely.union(pavement, zebras))
-    verge = shapely.difference(_union(verges, reach), shapely.union_all([pavement, zebras, road]))
+    crossing = overlay.difference(zebras, pavement)
+    road = overlay.difference(_union(roads, reach), overlay.union(pavement, zebras))
+    verge = overlay.difference(_union(verges, reach), overlay.union_all([pavement, zebras, road]))
     mouths = [_driveway(s, at_m, 0.0, 0.1) for s in strips for at_m in s.driveways]
     aprons = [_driveway(s, at_m, -s.verge_m, 0.0) for s in strips for at_m in s.driveways if s.verge_m]
-    apron = shapely.intersection(_union(aprons, reach, closed=False), verge)
-    ramp_to = shapely.union(zebras, _union(mouths, reach, closed=False))
-    verge = shapely.difference(verge, apron)
+    apron = overlay.intersection(_union(aprons, reach, closed=False), verge)
+    ramp_to = overlay.union(zebras, _union(mouths, reach, closed=False))
+    verge = overlay.difference(verge, apron)
     bars = [_stripes(s) for s in crossings]
-    stripes = shapely.intersection(shapely.union_all(bars), crossing)
+    stripes = overlay.intersection(overlay.union_all(bars), crossing)
     zones = {"pavement": pavement, "crossing": crossing, "road": road, "verge": verge, "apron": apron}
     zones["ramp_to"] = ramp_to
     for zone in (*zones.values(), stripes):
@@ -213,18 +214,18 @@ def _driven(street_map: StreetMap, outline: shapely.Geometry) -> list[shapely.Ge
     lanes = [lane.polygon for lane in street_map.near("lane", junction) if getattr(lane, "kind", "") == "road"]
     if not lanes or not walked:
         return [junction]
-    parts = shapely.get_parts(shapely.difference(junction, union_closed([shapely.make_valid(p) for p in walked])))
-    return list(parts[shapely.dwithin(parts, shapely.union_all(lanes), 0.01)])
+    parts = shapely.get_parts(overlay.difference(junction, union_closed([shapely.make_valid(p) for p in walked])))
+    return list(parts[shapely.dwithin(parts, overlay.union_all(lanes), 0.01)])
 
 
 def _union(polygons: Sequence[shapely.Geometry], reach: shapely.Polygon, closed: bool = True) -> shapely.Geometry:
     if not polygons:
         return shapely.Polygon()
-    cut = shapely.intersection(shapely.make_valid(np.asarray(polygons, dtype=object)), reach)
+    cut = overlay.intersection(shapely.make_valid(np.asarray(polygons, dtype=object)), reach)
     parts = [part for part in shapely.get_parts(cut) if shapely.area(part) > 0.0]
     if not parts:
         return shapely.Polygon()
-    return union_closed(parts) if closed else shapely.union_all(parts)
+    return union_closed(parts) if closed else overlay.union_all(parts)
 
 
 def _stripes(crossing: Strip) -> shapely.Geometry:
@@ -238,7 +239,7 @@ def _stripes(crossing: Strip) -> shapely.Geometry:
         aside = 0.5 * (crossing.width_m - 0.2) * np.array([-math.sin(heading), math.cos(heading)])
         middle = np.array([x, y])
         bars.append(shapely.Polygon(middle + np.array([along + aside, aside - along, -along - aside, along - aside])))
-    return shapely.union_all(bars)
+    return overlay.union_all(bars)
 
 
 def _faces(
@@ -251,7 +252,7 @@ def _faces(
     """The faces of the arrangement of all outlines within `border`; ends: lines that divide them further."""
     contours = [shapely.buffer(zones["ramp_to"], share * RAMP_M, quad_segs=3) for share in (0.5, 1.0)]
     curbstone = shapely.buffer(zones["road"], CURBSTONE_M, join_style="mitre", mitre_limit=2.0)
-    on_high = shapely.difference(shapely.boundary(np.array([*contours, curbstone], dtype=object)), low)
+    on_high = overlay.difference(shapely.boundary(np.array([*contours, curbstone], dtype=object)), low)
     outlines = shapely.boundary(
         np.array([*(zones[k] for k in ("pavement", "crossing", "road", "verge", "apron")), stripes])
     )

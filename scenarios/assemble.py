@@ -11,6 +11,7 @@ from pathlib import Path
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
+from cosim import overlay
 from cosim.clock import Clock
 from cosim.control import Limits
 from cosim.injection import Injected
@@ -113,7 +114,7 @@ def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | M
     """An area minus the ground that props cover; the area itself where none stands on it."""
     ground = footprints(props)
     ground = ground[shapely.intersects(area, ground)]
-    return shapely.difference(area, shapely.union_all(ground)) if len(ground) else area  # type: ignore[return-value]
+    return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area
 
 
 @lru_cache(maxsize=1)

@@ -9,6 +9,7 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 
+from cosim import overlay
 from cosim.errors import SpecError
 from cosim.geometry import Floats, Polyline
 from cosim.scenario import Barrier
@@ -114,7 +115,8 @@ def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon
     fences = [outline(barrier) for barrier in barriers]
     if not fences:
         return area
-    return shapely.difference(area, shapely.union_all(np.array(fences, dtype=object)))  # type: ignore[return-value]
+    left: Polygon | MultiPolygon = overlay.difference(area, overlay.union_all(fences))
+    return left
 
 
 def prove_single_path(
@@ -128,7 +130,7 @@ def prove_single_path(
     the area is eroded by half the robot's width, so the robot fits through.
     """
     strips = union_closed([street_map.strips[port.strip].polygon for port in way])
-    surroundings = shapely.buffer(shapely.union(strips, LineString(route.points)), REACH_M)
+    surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), REACH_M)
     free = fenced(street_map.walkable_near(surroundings), barriers)
     start, goal = Point(route.points[0]), Point(route.points[-1])
     part = _part_with(free, start)

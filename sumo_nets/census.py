@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from cosim import overlay
 from cosim.geometry import Floats
 from cosim.streetmap import Lane, StreetMap, Strip
 from cosim.walks import WalkGraph
@@ -134,7 +135,7 @@ def clear_width_m(
     ground: shapely.Geometry = shapely.simplify(place.walkable, 0.01)
     shapely.prepare(ground)
     if in_the_way := [thing for thing in standing if shapely.intersects(ground, thing)]:
-        ground = shapely.difference(ground, shapely.union_all(in_the_way))
+        ground = overlay.difference(ground, overlay.union_all(in_the_way))
     lines = shapely.linestrings(
         np.concatenate([strip.line[:, :2] for strip in place.strips.values()]),
         indices=np.repeat(np.arange(len(place.strips)), [len(strip.line) for strip in place.strips.values()]),

@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
+from cosim import overlay
 from cosim.geometry import Floats
 from cosim.streetmap import SEAM_M, Corner, Port, StreetMap, Strip, union_closed
 
@@ -62,7 +63,7 @@ def passable(street_map: StreetMap, corner: Corner) -> Polygon | None:
             bands.append(_band(ends[i], ends[k], width_m))
             old = groups[k]
             groups = [groups[i] if group == old else group for group in groups]
-    whole = shapely.union_all([*shapely.get_parts(corner.polygon), *pads, *bands])
+    whole = overlay.union_all([*shapely.get_parts(corner.polygon), *pads, *bands])
     parts = [part for part in shapely.get_parts(whole) if isinstance(part, Polygon) and part.area > 0.0]
     return max(parts, key=lambda part: (int((shapely.distance(part, pads) < 0.05).sum()), part.area), default=None)
 
@@ -85,7 +86,7 @@ def _open(
     core = shapely.buffer(polygon, -clear_m)
     if isinstance(core, Polygon) and not core.is_empty and shapely.distance(core, at).max() <= 1.5 * clear_m:
         return True
-    mouths = shapely.intersection([s.polygon for s in strips], shapely.buffer(at, np.maximum(widths / 2.0, 1.0)))
+    mouths = overlay.intersection([s.polygon for s in strips], shapely.buffer(at, np.maximum(widths / 2.0, 1.0)))
     for i, k in combinations(range(len(ends)), 2):
         first, second = _groups([polygon, mouths[i], mouths[k]], ends[[i, k]], clear_m)
         if first != second:

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import Point, Polygon
 
+from cosim import overlay
 from cosim.geometry import Floats
 from cosim.streetmap import Feature, FeatureKind, Lane, StreetMap, Strip
 from sumo_nets.osmfeatures import Found, Mapped
@@ -129,7 +130,7 @@ class _Index:
 
     def union(self, area: shapely.Geometry, within_m: float) -> shapely.Geometry:
         near = np.sort(self._tree.query(area, predicate="dwithin", distance=within_m))
-        return shapely.union_all(self._polygons[near])
+        return overlay.union_all(self._polygons[near])
 
 
 class _Lines:
@@ -200,10 +201,10 @@ def _front(part: Polygon, heading_rad: float) -> float:
 def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
     """What is left of a building off the streets, splinters left out."""
     ground = shapely.buffer(taken, WALL_M, join_style="mitre", mitre_limit=2.0)
-    left = shapely.simplify(shapely.difference(whole, ground), 0.05)
+    left = shapely.simplify(overlay.difference(whole, ground), 0.05)
     left = shapely.buffer(shapely.buffer(left, -0.3, join_style="mitre"), 0.3, join_style="mitre", mitre_limit=2.0)
     # Mitres may reach out again, and corners lie on the centimetre in the file.
-    left = shapely.set_precision(shapely.difference(shapely.intersection(left, whole), ground), 0.01)
+    left = shapely.set_precision(overlay.difference(overlay.intersection(left, whole), ground), 0.01)
     return [p for p in shapely.get_parts(left) if isinstance(p, Polygon) and p.is_valid and p.area >= LEFT_M2]
 
 
@@ -218,7 +219,7 @@ def _settled(
     for thing in mapped:
         radius = 0.5 * math.hypot(*EXTENT_M[thing.kind])
         spot = Point(thing.rings[0][0])
-        closed = shapely.union(streets.closed(spot), houses.union(spot, 2.0 * MOVED_M))
+        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * MOVED_M))
         at = _free_spot(spot, closed, radius)
         if at is None:
             counts["left out on a road, a crossing or in a narrow passage"] += 1

@@ -18,12 +18,14 @@ import shapely
 
 from cosim.errors import MachineError, MapError, UsageError
 from cosim.mapcheck import NetFacts
+from cosim.overlay import place_of
 from cosim.streetmap import Feature
 from sumo_nets.cornermend import mend_corners
 from sumo_nets.drivingside import left_hand_country
 from sumo_nets.featurefit import fitted
+from sumo_nets.netconvert import complaints, netconvert
 from sumo_nets.netfacts import allows, facts_of, footway, net_root, read_facts
-from sumo_nets.netfile import netconvert, read_net
+from sumo_nets.netfile import read_net
 from sumo_nets.osmfeatures import osm_features
 from sumo_nets.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.signalcheck import mend_signals
@@ -309,8 +311,8 @@ def _start_sumo(file: MapFile, net: Path) -> None:
     except OSError as error:
         raise MachineError(f"sumo cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
     if done.returncode != 0:
-        tail = "\n".join(done.stderr.strip().splitlines()[-6:])
-        raise MapError(f"{file.source}: SUMO refuses the net (sumo -n NET -e 1 ends with {done.returncode}):\n{tail}")
+        ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
+        raise MapError(f"{file.source}: SUMO refuses the net {ended}{complaints(done.stderr)}")
 
 
 def _sumo_home() -> Path:
@@ -328,17 +330,15 @@ def _told_of(file: MapFile) -> Iterator[None]:
         raise MapError(_retold(file, str(error))) from error
     except KeyError as error:
         raise MapError(f"{file.source}: not a street net that can be read: attribute {error} is missing") from error
-    except (ValueError, IndexError, shapely.errors.GEOSException) as error:
+    except shapely.errors.GEOSException as error:
+        raise MapError(f"{file.source}: its ground{place_of(error)} cannot be put together: {error}") from error
+    except (ValueError, IndexError) as error:
         raise MapError(f"{file.source}: not a street net that can be read: {error}") from error
 
 
 def _retold(file: MapFile, words: str) -> str:
-    readable = file.packing in ("", "gzip")
-    shown = str(file.source) if readable else file.source.with_suffix("").name
     words = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", words)
-    words = words.replace(str(file.path), shown).replace(f"{file.path.parent}/", "")
+    words = words.rstrip(".").replace(str(file.path), str(file.source)).replace(f"{file.path.parent}/", "")
     if "without any edge" in words or "No nodes loaded" in words:
-        words += "\nNo street of the file survived the conversion: import a larger area, with whole streets in it."
-    if "netconvert" in words and not readable:
-        words += f"\n(netconvert cannot read {file.packing}: unpack {file.source.name} first to repeat this)"
+        words += "; no street of the file survived the conversion: import a larger area, with whole streets in it"
     return words if words.startswith(f"{file.source}: ") else f"{file.source}: {words}"

@@ -11,6 +11,7 @@ from typing import Final
 import shapely
 from shapely.geometry import Point
 
+from cosim import overlay
 from cosim.streetmap import Lane, StreetMap
 
 ROOM_M: Final = 0.3
@@ -52,7 +53,7 @@ class Kerbs:
             polygon = self._map.corners[corner].polygon
             taken = [s.polygon for s in self._map.near("strip", polygon) if s.id.startswith(":")]
             taken += [s.polygon for s in self._map.near("lane", polygon) if isinstance(s, Lane) and s.kind == "road"]
-            free = shapely.difference(polygon, shapely.union_all(taken)) if taken else polygon
+            free = overlay.difference(polygon, overlay.union_all(taken)) if taken else polygon
             ground = shapely.buffer(free, -ROOM_M)
             shapely.prepare(ground)
             self._ground[corner] = ground

@@ -1,4 +1,4 @@
-"""Street nets on disk: netconvert, with its failures as MapError; and any .net.xml(.gz) as a StreetMap.
+"""Any .net.xml(.gz) as a StreetMap.
 
 The reader streams the file once through expat and makes all polygons in a few vectorised calls.
 """
@@ -8,7 +8,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import re
-import subprocess
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
@@ -21,8 +20,9 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Point, Polygon
 
-from cosim.errors import MachineError, MapError
+from cosim.errors import MapError
 from cosim.geometry import Floats
+from cosim.overlay import place_of
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.elevation import land_of, steep_ports, steep_strips
 from sumo_nets.outlines import areas_of, bands, coordinates, polylines
@@ -38,27 +38,6 @@ TRAMS = frozenset(("tram", "rail_urban"))
 SCHEMA = b"xsi:noNamespaceSchemaLocation"
 
 Attributes = dict[str, str]
-
-
-def netconvert(arguments: Sequence[str], output: Path, timeout_s: float = 120.0) -> Path:
-    """Run netconvert to make `output`. Raises MapError with the command and the end of its complaints."""
-    import sumo
-
-    command = [str(Path(sumo.__file__).parent / "bin" / "netconvert"), *arguments, "-o", str(output)]
-    shown = " ".join(["netconvert", *command[1:]])
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, errors="replace", timeout=timeout_s, check=False)
-    except subprocess.TimeoutExpired as error:
-        raise MapError(f"netconvert did not end within {timeout_s:g} s: {shown}") from error
-    except OSError as error:
-        raise MachineError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed? {shown}") from error
-    tail = "\n".join(done.stderr.strip().splitlines()[-8:])
-    if done.returncode != 0 or not output.exists():
-        raise MapError(f"netconvert failed with exit code {done.returncode}: {shown}\n{tail}")
-    # An exit code of 0 is no proof: an empty net ends in "Success" too.
-    if b"<edge " not in output.read_bytes():
-        raise MapError(f"netconvert made a net without any edge: {shown}\n{tail}")
-    return output
 
 
 def without_comments(net: bytes) -> bytes:
@@ -82,7 +61,11 @@ def read_net(path: Path) -> StreetMap:
         return _street_map(path, raw, _hash(data))
     except KeyError as error:
         raise MapError(f"{path}: not a street net that can be read: attribute {error} is missing") from error
-    except (ValueError, IndexError, shapely.errors.GEOSException) as error:
+    except MapError as error:
+        raise MapError(f"{path}: {error}") from error
+    except shapely.errors.GEOSException as error:
+        raise MapError(f"{path}: its ground{place_of(error)} cannot be put together: {error}") from error
+    except (ValueError, IndexError) as error:
         raise MapError(f"{path}: not a street net that can be read: {error}") from error
 
 

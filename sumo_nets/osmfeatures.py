@@ -178,10 +178,14 @@ def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
         if not outer or inner is None:
             skipped["buildings with an open outline"] += 1
             continue
-        yards = shapely.union_all(inner)
-        found += _built(
-            [part for o in outer for part in shapely.get_parts(shapely.difference(o, yards))], tags, skipped
-        )
+        try:
+            walled = [
+                part for o in outer for part in shapely.get_parts(shapely.difference(o, shapely.union_all(inner)))
+            ]
+        except shapely.errors.GEOSException:
+            skipped["buildings whose outline crosses itself"] += 1
+            continue
+        found += _built(walled, tags, skipped)
     return found
 
 

@@ -15,6 +15,7 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
+from cosim import overlay
 from cosim.geometry import Floats
 
 REACH_M = 2.5
@@ -61,14 +62,14 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     left, right = ends + aside, ends - aside
     beyond = shapely.polygons(np.stack([right, left, left + REACH_M * forth, right + REACH_M * forth], axis=1))
     edges = shapely.linestrings(np.stack([right, left], axis=1))
-    met = shapely.intersection(beyond, corners)
+    met = overlay.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))
-    hulls = shapely.intersection(shapely.convex_hull(shapely.union(edges, met)), beyond)
+    hulls = overlay.intersection(shapely.convex_hull(overlay.union(edges, met)), beyond)
     # Slivers without width make GEOS divide by zero; it copes.
     with np.errstate(divide="ignore", invalid="ignore"):
-        wedges = shapely.buffer(shapely.difference(hulls, corners), WELD_M, join_style="mitre")
+        wedges = shapely.buffer(overlay.difference(hulls, corners), WELD_M, join_style="mitre")
     out: Polygons = polygons.copy()
-    grown = shapely.union(polygons, wedges)
+    grown = overlay.union(polygons, wedges)
     out[wanted] = [_holding(shape, strip) for shape, strip in zip(grown[wanted], polygons[wanted], strict=True)]
     return out
 
@@ -77,4 +78,4 @@ def _holding(shape: Polygon | MultiPolygon, strip: Polygon) -> Polygon:
     """The part of a shape that holds a strip: slivers of a wedge on the far side of a corner are nothing."""
     if isinstance(shape, Polygon):
         return shape
-    return max(shape.geoms, key=lambda part: float(part.intersection(strip).area))
+    return max(shape.geoms, key=lambda part: float(overlay.intersection(part, strip).area))

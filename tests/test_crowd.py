@@ -19,7 +19,8 @@ from cosim.state import RobotState, Street
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from sumo_nets.crowd import SumoCrowd
-from sumo_nets.netfile import netconvert, read_net
+from sumo_nets.netconvert import netconvert
+from sumo_nets.netfile import read_net
 from sumo_nets.stoplines import StopLines
 from sumo_nets.store import build_city
 

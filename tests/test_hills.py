@@ -21,7 +21,8 @@ from physics.world import BulletWorld
 from scenarios.run import episode
 from scenarios.sample import suite_on_map
 from sumo_nets.mapstore import checked_map, import_map
-from sumo_nets.netfile import netconvert, read_net
+from sumo_nets.netconvert import netconvert
+from sumo_nets.netfile import read_net
 
 pytestmark = pytest.mark.engine
 

@@ -20,6 +20,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString
 
+from cosim import overlay
 from cosim.geometry import Floats, Polyline
 from cosim.scenario import Barrier
 from cosim.state import PERSON_RADIUS_M
@@ -144,9 +145,9 @@ def behavior_graph(
     roads = [lane.polygon for lane in lanes if lane.kind == "road"]
     things = [*footprints(props), *(b.polygon for b in buildings), *(outline(barrier) for barrier in barriers)]
     walk = union_closed([s.polygon for s in strips] + [c.polygon for c in corners]) if strips else shapely.Polygon()
-    blocked = shapely.union_all(_grown(things, PERSON_RADIUS_M + _GAP_M) + _grown(roads, PERSON_RADIUS_M))
-    open_ground = shapely.difference(shapely.buffer(walk, OFF_WALK_M, quad_segs=4), blocked)
-    footing = shapely.difference(shapely.buffer(walk, -_EDGE_M), blocked)
+    blocked = overlay.union_all(_grown(things, PERSON_RADIUS_M + _GAP_M) + _grown(roads, PERSON_RADIUS_M))
+    open_ground = overlay.difference(shapely.buffer(walk, OFF_WALK_M, quad_segs=4), blocked)
+    footing = overlay.difference(shapely.buffer(walk, -_EDGE_M), blocked)
     for shape in (open_ground, footing):
         shapely.prepare(shape)
 
@@ -178,7 +179,7 @@ def _joined(
     ways, points = kept[kept < len(idle)], kept[kept >= len(idle)]
     spurs = ends[np.isin(ends[:, 1], points)]
     ways_out = shapely.buffer(_segments(xy[spurs[:, 0]], xy[spurs[:, 1]]), _SPUR_M, quad_segs=2)
-    reach = shapely.union_all([footing, *shapely.intersection(ways_out, open_ground)])
+    reach = overlay.union_all([footing, *overlay.intersection(ways_out, open_ground)])
     shapely.prepare(reach)
     places = tuple(found[i - len(idle)] for i in points.tolist())
     whole = xy[kept]

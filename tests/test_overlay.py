@@ -1,0 +1,93 @@
+"""Putting ground together where GEOS gives up: tangled corners and slivers, as foreign maps have them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, Polygon, box
+
+from cosim import overlay
+from cosim.errors import MapError
+from sumo_nets.netfile import read_net
+
+TANGLED = [
+    # A walking area that crosses itself, and a sidewalk of three points that ends in it: shape of the area, shape of
+    # the sidewalk, width in metres.
+    (
+        "1747.70,174.54 1748.46,173.49 1747.08,170.50 1750.59,172.01 1747.34,170.75 1748.30,171.06 1745.09,174.80 "
+        "1751.17,172.61",
+        "1750.61,172.33 1750.53,172.35 1750.38,172.62",
+        2.0,
+    ),
+    (
+        "2025.37,105.45 2024.68,104.96 2025.67,105.12 2025.02,105.54 2024.97,105.59 2025.40,105.45 2025.02,105.54",
+        "2025.37,105.45 2017.41,104.93 2017.11,105.07",
+        3.2,
+    ),
+    (
+        "1241.57,2135.44 1241.81,2135.49 1241.00,2135.09 1241.18,2135.31 1241.18,2135.13 1241.59,2135.11 "
+        "1241.70,2135.16 1241.18,2135.13 1241.18,2135.31",
+        "1241.18,2135.13 1238.97,2145.30 1239.00,2145.29 1251.21,2147.75 1249.17,2144.67",
+        0.5,
+    ),
+]
+
+
+@pytest.mark.parametrize(("area", "walk", "width_m"), TANGLED, ids=["corner-a", "corner-b", "corner-c"])
+def test_a_net_is_read_whose_corner_geos_cannot_join(tmp_path: Path, area: str, walk: str, width_m: float) -> None:
+    """Where the wedge between a sidewalk and its tangled corner cannot be joined as it is, the place is read anyway."""
+    path = tmp_path / "tangled.net.xml"
+    path.write_text(
+        f"""<net version="1.20"><edge id=":J_w0" function="walkingarea"><lane id=":J_w0_0" allow="pedestrian"
+        length="3" shape="{area}"/></edge><edge id="a"><lane id="a_0" allow="pedestrian" width="{width_m}" length="9"
+        shape="{walk}"/></edge><connection from=":J_w0" to="a" fromLane="0" toLane="0"/></net>"""
+    )
+    strip = read_net(path).strips["a"]
+    assert strip.polygon.is_valid
+    line = LineString(strip.line)
+    assert strip.polygon.buffer(0.01).covers(line) and strip.polygon.area >= 0.9 * line.length * width_m
+
+
+def crossing_itself() -> Polygon:
+    """A bow tie, which GEOS does not overlay."""
+    return Polygon([(0, 0), (4, 4), (4, 0), (0, 4)])
+
+
+@pytest.mark.parametrize("name", ["union", "difference", "intersection"])
+def test_what_geos_refuses_is_repaired(name: str) -> None:
+    """A shape that crosses itself is overlaid all the same, alone and among others; those others keep their bits."""
+    operation, plain = getattr(overlay, name), getattr(shapely, name)
+    bow, square = crossing_itself(), box(1.0, 1.0, 3.0, 9.0)
+    with pytest.raises(shapely.errors.GEOSException, match=r"side location conflict|non-noded"):
+        plain(bow, square)
+    repaired = shapely.make_valid(bow, method="structure")
+    assert operation(bow, square).is_valid
+    assert operation(bow, square).area == pytest.approx(plain(repaired, square).area, abs=1e-6)
+    whole = box(0.1, 0.2, 3.3, 7.7)
+    many = operation(np.array([whole, bow, None], dtype=object), square)
+    assert many[0].wkb == plain(whole, square).wkb and many[1].is_valid and many[2] is None
+
+
+def test_what_geos_accepts_keeps_its_bits() -> None:
+    """Where the plain operation succeeds, nothing is repaired or snapped."""
+    rng = np.random.default_rng(4)
+    lines = shapely.linestrings(np.cumsum(rng.normal(0.0, 3.0, (60, 5, 2)), axis=1))
+    shapes = shapely.buffer(lines, rng.uniform(0.5, 3.0, 60), cap_style="flat", join_style="mitre")
+    assert overlay.union_all(shapes).wkb == shapely.union_all(shapes).wkb
+    for name in ("union", "difference", "intersection"):
+        mine, plain = (getattr(module, name)(shapes[:30], shapes[30:]) for module in (overlay, shapely))
+        assert [s.wkb for s in mine] == [s.wkb for s in plain]
+
+
+def test_what_nothing_helps_is_told_with_its_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A failure of GEOS that stays is a MapError that says where, in words."""
+
+    def broken(*_shapes: object, **_options: object) -> None:
+        raise shapely.errors.GEOSException("TopologyException: side location conflict at 12.345 -6.5.")
+
+    monkeypatch.setattr(shapely, "union", broken)
+    with pytest.raises(MapError, match=r"the ground near \(12\.3, -6\.5\) is too tangled"):
+        overlay.union(box(0, 0, 1, 1), box(1, 0, 2, 1))
