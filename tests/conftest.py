@@ -23,7 +23,7 @@ PATIENCE_S = 600.0
 """How long a test waits for what must happen: far beyond what a slow and busy machine needs. A test never waits for
 it to be over, so that it costs nothing where all is well."""
 
-WIDE = {"COLUMNS": "160", "NO_COLOR": "1"}
+WIDE = {"COLUMNS": "200", "NO_COLOR": "1"}
 """So that what the command line prints can be read by a test."""
 
 settings.register_profile(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 from typing import NoReturn
 
@@ -29,6 +27,7 @@ from scenarios.run import episode
 from sumo_nets.again import StreetAgain
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.entrances import Entrances
+from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
 
@@ -94,22 +93,15 @@ def test_everybody_who_came_to_the_robot_comes_without_it_too(scenario: Scenario
     assert cars.delay_s > 5.0
 
 
-def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, tmp_path: Path) -> None:
+def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, tmp_path: Path, cosim: Cosim) -> None:
     """The delays are in row and record of the run that asked; nothing else differs from the run that did not."""
-    write_suite(Suite(name="one", version="1", scenarios=(scenario,)), tmp_path / "one.json")
-    words = ["run", "one.json", "--policy", "orca", "--out", "asked", "--counterfactual"]
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim", *words],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-        check=False,
-    )
+    short = msgspec.structs.replace(scenario, time_limit_s=10.0)
+    write_suite(Suite(name="one", version="1", scenarios=(short,)), tmp_path / "one.json")
+    done = cosim("run", "one.json", "--policy", "orca", "--out", "asked", "--counterfactual", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "against the same street without the robot" in done.stdout
     row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
-    plain = episode(scenario, load_policy("orca"), suite_hash=str(row["suite_hash"])).record
+    plain = episode(short, load_policy("orca"), suite_hash=str(row["suite_hash"])).record
     asked = Record.load(tmp_path / "asked" / "episodes" / scenario.id / "record.json")
     names = ["people_delay_s", "people_compared", "vehicles_delay_s", "vehicles_compared"]
     assert asked.state_hash == plain.state_hash
@@ -121,12 +113,12 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, t
 def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_path: Path) -> None:
     """Between the last progress of an episode of five seconds and its end it tells five times how far it is."""
     short = Suite(name="s", version="1", scenarios=(msgspec.structs.replace(scenario, time_limit_s=5.0),))
-    manifest = load_policy("stop").manifest
+    manifest = load_policy("orca").manifest
     spec = RunSpec(
         suite="s",
         suite_version="1",
         suite_hash=short.content_hash,
-        policy="stop",
+        policy="orca",
         policy_name=manifest.name,
         policy_version=manifest.version,
         scenarios=(scenario.id,),
@@ -135,7 +127,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     )
     told: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
-        run_all(folder, short.scenarios, "stop", manifest, jobs=1, tell=told.append)
+        run_all(folder, short.scenarios, "orca", manifest, jobs=1, tell=told.append)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
 
@@ -148,7 +140,7 @@ def test_an_episode_outlives_its_comparison(scenario: Scenario, monkeypatch: pyt
 
     monkeypatch.setattr("scenarios.run.Beside.compared", fails)
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
-    outcome = episode(short, load_policy("stop"), counterfactual=True)
+    outcome = episode(short, load_policy("orca"), counterfactual=True)
     assert outcome.record.status == "done" and outcome.log is not None and "fails" in outcome.traceback
     assert outcome.record.reason == "the street without the robot: KeyError: 'v7'"
     assert "people_delay_s" not in outcome.record.measures

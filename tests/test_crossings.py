@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
-import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -27,6 +25,7 @@ from scenarios.assemble import place
 from scenarios.crossings import AFTER_M, BEFORE_M, build_all
 from scenarios.run import episode
 from sumo_nets.crowd import SumoCrowd
+from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
 
@@ -56,26 +55,25 @@ def test_a_city_has_only_so_many_crossings() -> None:
         build_all(SMALL, street_map, WalkGraph(street_map), 3, 10_000)
 
 
-def bench_crossings(*words: str, columns: int, cwd: Path | None = None) -> str:
-    """What `cosim bench crossings` prints."""
-    done = subprocess.run(
-        [sys.executable, "-m", "cosim", "bench", "crossings", *words],
-        cwd=cwd,
-        capture_output=True,
-        text=True,
-        timeout=300.0,
-        check=False,
-        env=os.environ | {"COLUMNS": str(columns)},
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture
+def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """What `cosim bench crossings` prints, in small cities."""
+    monkeypatch.setattr("scenarios.bench_crossings.SIZE_M", 600.0)
+
+    def said(*words: str, cwd: Path | None = None) -> str:
+        done = cosim("bench", "crossings", *words, cwd=cwd)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return said
 
 
-def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red() -> None:
+def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(bench: Callable[..., str]) -> None:
     """One crossing from the command line: the robot arrives, nothing at red by it; people and vehicles are counted."""
-    told = bench_crossings("--crossings", "1", "--policy", "orca", columns=160)
+    told = bench("--crossings", "1", "--policy", "orca")
     rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", told)}
     assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
+    assert rows["waited at red"] == "1"
     assert int(re.findall(r"(\d+) vehicles passed stop lines", told)[0]) > 0
 
 
@@ -101,10 +99,10 @@ class Dies:
 """
 
 
-def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path) -> None:
+def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path, bench: Callable[..., str]) -> None:
     """A policy raises at its first crossing; made anew, it ends the process at the second: both rows say which."""
     (tmp_path / "dies.py").write_text(DIES)
-    told = bench_crossings("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", columns=200, cwd=tmp_path)
+    told = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
     (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", told)
     assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
 
@@ -126,7 +124,7 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
     """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none touches it."""
     _, street_map = place(SMALL)
     drawn = build_all(SMALL, street_map, WalkGraph(street_map), 0, 1)[0]
-    busy = msgspec.structs.replace(drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=60.0)
+    busy = msgspec.structs.replace(drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=45.0)
     slowest: dict[str, float] = {}
 
     def watch(step: Step, verdict: Verdict) -> None:

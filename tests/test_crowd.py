@@ -18,11 +18,12 @@ from cosim.scenario import City, CrowdSpec
 from cosim.state import RobotState, Street
 from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
+from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.netconvert import netconvert
 from sumo_nets.netfile import read_net
 from sumo_nets.stoplines import StopLines
-from sumo_nets.store import build_city
+from sumo_nets.store import city_net
 
 pytestmark = pytest.mark.engine
 
@@ -36,11 +37,10 @@ class Place(NamedTuple):
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Place:
+def place() -> Place:
     """A city of 600 m."""
-    net = tmp_path_factory.mktemp("net") / "city.net.xml"
-    build_city(City(seed=2, size_m=600.0), net)
-    street_map = read_net(net)
+    net = city_net(City(seed=2, size_m=600.0))
+    street_map = street_map_of(net)
     return Place(net, street_map, WalkGraph(street_map))
 
 
@@ -138,12 +138,12 @@ def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
 
 
 def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
-    """In two minutes beside a standing robot on a sidewalk people pass, and nobody comes nearer than 0.5 m."""
+    """In a minute and a half beside a standing robot people pass on the sidewalk, nobody nearer than 0.5 m."""
     start = middle(place)
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest, passed = math.inf, set()
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
-        for tick in range(2400):
+        for tick in range(1800):
             street = crowd.step(at(start), reply(tick))
             near = gaps(street, start)
             nearest = min(nearest, float(near.min()))
@@ -159,6 +159,8 @@ def test_an_absent_robot_is_walked_through(place: Place) -> None:
     with SumoCrowd(place.net, place.map, CrowdSpec(persons=60, radius_m=60.0, vehicles=0), 4, OPEN, start[:2]) as crowd:
         for tick in range(2400):
             nearest = min(nearest, float(gaps(crowd.step(at(start), reply(tick), absent=True), start).min()))
+            if nearest < 0.4:
+                break
     assert nearest < 0.4
 
 
@@ -234,7 +236,7 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
     behind = strip.polygon.difference(shapely.Point(place.graph.point(port)).buffer(3.0))
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
 
-    def passed(closed: frozenset[Port]) -> int:
+    def passed(closed: frozenset[Port], most: int) -> int:
         side: dict[str, str] = {}
         count = 0
         with SumoCrowd(place.net, place.map, spec, 8, closed, start[:2]) as crowd:
@@ -245,10 +247,12 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
                     for name in (people.ids[i] for i in np.flatnonzero(inside)):
                         count += side.get(name, where) != where
                         side[name] = where
+                if count >= most:
+                    break
         return count
 
-    assert passed(OPEN) > 0
-    assert passed(frozenset({port})) == 0
+    assert passed(OPEN, 3) == 3
+    assert passed(frozenset({port}), 1) == 0
 
 
 def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> None:
@@ -280,18 +284,18 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
     """A second run in the same process repeats every array; another seed does not."""
     start = middle(place)
 
-    def run(seed: int) -> list[Street]:
+    def run(seed: int, ticks: int) -> list[Street]:
         spec = CrowdSpec(persons=50, radius_m=80.0, vehicles=20)
         streets = []
         with SumoCrowd(place.net, place.map, spec, seed, OPEN, start[:2]) as crowd:
             streets.append(crowd.street)
-            for tick in range(600):
+            for tick in range(ticks):
                 pose = Pose(start.x_m + 0.05 * tick * math.cos(start.heading_rad), start.y_m, start.heading_rad)
                 actor = Actor(id="e1", x_m=pose.x_m + 2.0, y_m=pose.y_m, heading_rad=0.0, speed_mps=1.0, doing="walk")
                 streets.append(crowd.step(at(pose), reply(tick, actor)))
         return streets
 
-    first, second, other = run(1), run(1), run(2)
+    first, second, other = run(1, 500), run(1, 500), run(2, 0)
     for a, b in zip(first, second, strict=True):
         assert a.people.ids == b.people.ids and a.people.doing == b.people.doing and a.vehicles.ids == b.vehicles.ids
         assert a.signals == b.signals
