@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
 from cosim.cli_progress import doing
@@ -86,19 +85,14 @@ def film(
     from scenarios.film import Cut, film
 
     picked = view_of(view)
-    bars = Progress(
-        TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn(), console=err
+    until_s = math.inf if end is None else end
+    with doing("choosing the camera") as tell:
+        cut = Cut(start, until_s, size_of(size), speed, camera_here(camera), picked)
+        to_s = film(folder, episode, output, cut, tell)
+    same = (
+        "the state hash is the record's" if to_s == math.inf else f"of its first {to_s:g} s every tick is as recorded"
     )
-    with bars:
-        task = bars.add_task(f"filming {episode}", total=None)
-        film(
-            folder,
-            episode,
-            output,
-            Cut(start, math.inf if end is None else end, size_of(size), speed, camera_here(camera), picked),
-            lambda done, of: bars.update(task, completed=done, total=of),
-        )
-    out.print(f"Film: {output}", soft_wrap=True, highlight=False)
+    out.print(f"Film: {output} ({same})", soft_wrap=True, highlight=False)
 
 
 def view_of(name: str) -> View:

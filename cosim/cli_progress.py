@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from cosim.telling import Tell
+from cosim.telling import Tell, duration
 
 err = Console(stderr=True)
+SURE, SURE_S = 0.03, 3.0
+"""Of less of a stage than this share, or after less time, nothing is concluded."""
 
 
 @contextmanager
@@ -24,7 +27,15 @@ def doing(first: str, console: Console = err) -> Iterator[Tell]:
         columns = (SpinnerColumn(), TextColumn("{task.description}", markup=False), TimeElapsedColumn())
         with Progress(*columns, console=console, transient=True) as bars:
             task = bars.add_task(first, total=None)
-            yield lambda stage, share=None: bars.update(task, description=_in_words(stage, share))
+            now, began = first, time.monotonic()
+
+            def move(stage: str, share: float | None = None) -> None:
+                nonlocal now, began
+                if stage != now:
+                    now, began = stage, time.monotonic()
+                bars.update(task, description=in_words(stage, share, time.monotonic() - began))
+
+            yield move
         return
     said = ""
 
@@ -38,5 +49,11 @@ def doing(first: str, console: Console = err) -> Iterator[Tell]:
     yield tell
 
 
-def _in_words(stage: str, share: float | None) -> str:
-    return stage if share is None else f"{stage}: {100.0 * share:.0f} %"
+def in_words(stage: str, share: float | None, since_s: float) -> str:
+    """A stage, how much of it is done, and how long the rest takes, judged by the `since_s` seconds it took so far."""
+    if share is None:
+        return stage
+    words = f"{stage}: {100.0 * share:.0f} %"
+    if share < SURE or since_s < SURE_S:
+        return words
+    return f"{words}, about {duration(since_s * (1.0 - share) / share)} left"

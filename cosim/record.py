@@ -68,6 +68,12 @@ class Log:
     def __len__(self) -> int:
         return len(self.pose)
 
+    def row(self, tick: int) -> Floats:
+        """(14,) the values of a tick, in the order of `row_of`."""
+        columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
+        more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
+        return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)
+
     def save(self, path: Path) -> None:
         """Write as .npz, whole or not at all."""
         temporary = path.with_name(path.name + ".part")
@@ -201,6 +207,24 @@ class StateHash:
         return self._hash.hexdigest()
 
 
+def row_of(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
+    """The 14 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
+    robot = step.motion.robot
+    track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
+    travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
+    person_m = float(_away_m(step).min(initial=np.inf))
+    reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
+    speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
+    measured = (step.route_s_after_m, travelled_m, person_m, reset_s_m, float(verdict.waits_at_red))
+    return (*robot.pose, *speeds, *measured, float(road.carriageway), float(road.braked))
+
+
+def _away_m(step: Step) -> Floats:
+    """(N,) distances of the people's centres from the robot's."""
+    xy: Floats = step.street_after.people.xy - step.motion.robot.pose.xy
+    return np.hypot(xy[:, 0], xy[:, 1])
+
+
 class Recorder:
     """Collects the Steps of an episode into a Log."""
 
@@ -215,17 +239,10 @@ class Recorder:
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
-        robot, people = step.motion.robot, step.street_after.people
-        track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
-        travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
-        away = np.hypot(*(people.xy - robot.pose.xy).T) if len(people) else np.array([np.inf])
-        reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
-        speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
-        measured = (step.route_s_after_m, travelled_m, float(away.min()), reset_s_m, float(verdict.waits_at_red))
-        on_road = (float(road.carriageway), float(road.braked))
-        self._rows.append((*robot.pose, *speeds, *measured, *on_road))
+        self._rows.append(row_of(step, verdict, road))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
-            for i in np.flatnonzero(away[: len(people)] < self.PEOPLE_WITHIN_M):
+            people = step.street_after.people
+            for i in np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M):
                 x, y = people.xy[i]
                 kind = people.ids[i][0]
                 self._people.append((step.tick, float(x), float(y), kind == "e", kind == "n"))

@@ -11,5 +11,16 @@ class Tell(Protocol):
     def __call__(self, stage: str, share: float | None = None, /) -> None: ...
 
 
+def duration(seconds: float) -> str:
+    """A time in words, no finer than is known: 45 s, 12 min, 2 h 10 min."""
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    minutes = round(seconds / 60.0)
+    if minutes < 60:
+        return f"{minutes} min"
+    hours, rest = divmod(round(minutes, -1) if minutes >= 120 else minutes, 60)
+    return f"{hours} h {rest} min" if rest else f"{hours} h"
+
+
 def untold(stage: str, share: float | None = None, /) -> None:
     """Nobody wants to know."""

@@ -1,13 +1,14 @@
 """A film of an episode: its record is replayed, tick by tick, and drawn from behind, from above or from the robot.
 
-The replay is the same episode: at its end the state hash is held against the record's.
+The replay is the same episode: every tick is held against the recorded trajectory, and at the end of the episode the
+state hash against the record's. A film that ends earlier is simulated no further than its last picture: it has no
+state hash to show, but every tick of it is as recorded.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -27,10 +28,11 @@ from cosim.report.video import Video
 from cosim.scenario import Scenario
 from cosim.state import RobotState, Street
 from cosim.step import Step
+from cosim.telling import Tell, untold
 from physics.cameras import CameraChoice
 from scenarios.assemble import place, staged
 from scenarios.look import View, behind, over
-from scenarios.replay import check, recorded
+from scenarios.replay import Alike, check, recorded
 from scenarios.run import drive
 
 EASE_S: Final = 0.5
@@ -60,12 +62,15 @@ class Cut(NamedTuple):
     view: View = "follow"
 
 
-Tell = Callable[[int, int], None]
-"""Told the tick just drawn and the last one."""
+class _Enough(Exception):
+    """The last picture is drawn."""
 
 
-def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> None:
-    """Write the film of a finished episode. Raises RunError when there is none, or when the replay differs."""
+def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
+    """Write the film of a finished episode; the simulated second at which it ends, infinite for the episode's end.
+
+    Raises RunError when there is no such episode, or when the replay differs; then there is no file.
+    """
     told = recorded(folder, scenario_id)
     scenario, record, log = told
     if not cut.from_s < cut.to_s:
@@ -78,6 +83,7 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
     if cut.size[0] < SMALLEST_PX[0] or cut.size[1] < SMALLEST_PX[1]:
         least = "x".join(map(str, SMALLEST_PX))
         raise RunError(f"a film of {cut.size[0]}x{cut.size[1]} pixels: below {least} nothing can be read")
+    tell("reading the street map, starting SUMO, PyBullet and the camera")
     _, street_map = place(scenario.place)
     fps = round(1.0 / Clock().tick_s)
     driver = Replay(log.command)
@@ -87,12 +93,16 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell) -> 
         camera = stack.enter_context(stage.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, stage.parts.world.footprint_m)
         reel = _Reel(scenario, record, minimap, camera, video, cut, last, tell)
-        again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, reel.take)
-    try:
-        check(folder, told, again.state_hash)
-    except RunError:
-        output.unlink(missing_ok=True)
-        raise
+
+        def until_the_last(step: Step, _: Verdict) -> None:
+            if step.tick + 1 == last < len(log):
+                raise _Enough
+
+        watches = (Alike(folder, told).watch, reel.take, until_the_last)
+        with suppress(_Enough):
+            again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, *watches)
+            check(folder, told, again.state_hash)
+    return math.inf if last == len(log) else Clock().time_s(last)
 
 
 def robot_eye(cut: Cut) -> CameraSpec:
@@ -134,9 +144,11 @@ class _Reel:
         self._ahead = (1.0 - share) * self._ahead + share * ahead if self._ahead.any() else ahead
         self._over = (1.0 - share) * self._over + share * _framed(robot, step.street_after)
         first = Clock().ticks(self._cut.from_s)
+        if step.tick < first:
+            self._tell(f"simulating to {self._cut.from_s:g} s", step.tick / first)
         if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
             self._video.add(self._picture(step, robot, step.street_after))
-            self._tell(step.tick - first, self._last - first)
+            self._tell(f"filming {self._scenario.id}", (step.tick - first) / (self._last - first))
 
     def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
         width, height = self._cut.size

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
+import numpy as np
+
+from cosim.clock import Clock
 from cosim.errors import RunError, unknown
 from cosim.policies.replay import Replay
-from cosim.record import Log, Record, begun
+from cosim.record import Log, Record, begun, row_of
 from cosim.referee import Verdict
 from cosim.runfolder import read_records
 from cosim.scenario import Scenario, read_suite
@@ -19,6 +22,9 @@ from scenarios.assemble import staged
 from scenarios.counterfactual import Beside, Compared
 from scenarios.run import Watch, drive
 from sumo_nets.entrances import Entrances
+
+OF_THE_ROAD: Final = 12
+"""From this value of a row on it is about the roads, which are judged beside the loop."""
 
 
 class Recorded(NamedTuple):
@@ -68,19 +74,36 @@ def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]
     return record.state_hash, stage.entrances
 
 
+class Alike:
+    """Watches a replay, and holds every tick against the recorded trajectory, to the bit: the robot's pose, speeds and
+    command, its way, its resets, and how near the nearest person is."""
+
+    def __init__(self, folder: Path, told: Recorded) -> None:
+        self._folder, self._told = folder, told
+
+    def watch(self, step: Step, verdict: Verdict) -> None:
+        """The next tick. Raises RunError when it is not the recorded one."""
+        now, then = np.array(row_of(step, verdict)), self._told.log.row(step.tick)
+        if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
+            raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
+
+
 def check(folder: Path, told: Recorded, state_hash: str) -> None:
     """Raises RunError when a replay came out otherwise than recorded."""
-    record = told.record
-    if state_hash != record.state_hash:
-        here = versions()
-        changed = [
-            f"{name} {record.versions.get(name)}, here {here[name]}"
-            for name in here
-            if here[name] != record.versions.get(name)
-        ]
-        why = f"made with other versions: {'; '.join(changed)}" if changed else "of the same versions: of other code"
-        raise RunError(
-            f"{folder}: '{record.scenario}' was not the same when it was replayed ({state_hash[:16]}, recorded "
-            f"{record.state_hash[:16]}). The record is {why}, or it was changed. Replay it with the code that made it, "
-            "or run it again."
-        )
+    if state_hash != told.record.state_hash:
+        raise otherwise(folder, told, f"{state_hash[:16]}, recorded {told.record.state_hash[:16]}")
+
+
+def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
+    """The error for a replay that came out otherwise than recorded; what: the difference."""
+    record, here = told.record, versions()
+    changed = [
+        f"{name} {record.versions.get(name)}, here {here[name]}"
+        for name in here
+        if here[name] != record.versions.get(name)
+    ]
+    why = f"made with other versions: {'; '.join(changed)}" if changed else "of the same versions: of other code"
+    return RunError(
+        f"{folder}: '{record.scenario}' was not the same when it was replayed ({what}). The record is {why}, or it was "
+        "changed. Replay it with the code that made it, or run it again."
+    )

@@ -15,10 +15,12 @@ import pytest
 from cosim.errors import RunError
 from cosim.policies.replay import Replay
 from cosim.ports import Observation
+from cosim.record import Recorder
 from cosim.report.hud import Layout
 from cosim.report.video import Video
 from cosim.scenario import City, CrowdSpec, Suite, write_suite
 from cosim.walks import WalkGraph
+from physics.eyes import WorldCamera
 from scenarios.film import Cut, robot_eye
 from tests.conftest import Cosim
 
@@ -81,6 +83,45 @@ def test_the_robots_camera_sees_no_farther_aside_in_a_film(size: tuple[int, int]
         assert aside > 0.5
 
 
+def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
+    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the last picture nothing is simulated, and before the first nothing is drawn; it is said meanwhile."""
+    simulated, drawn = [], []
+    add, render = Recorder.add, WorldCamera.render
+    monkeypatch.setattr(Recorder, "add", lambda self, *told: simulated.append(add(self, *told)))
+    monkeypatch.setattr(WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told))
+    done = cosim("film", "run", "t-0", "--from", "0.5", "--to", "0.7", "--size", "320x180", "-o", "cut.mp4", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    assert (len(simulated), len(drawn)) == (14, 4)
+    assert done.stderr.splitlines()[-2:] == ["simulating to 0.5 s ...", "filming t-0 ..."]
+    assert "of its first 0.7 s every tick is as recorded" in done.stdout
+
+
+@pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
+def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, column: str) -> None:
+    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond the cut it is none."""
+    path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
+    kept = path.read_bytes()
+    with np.load(path) as arrays:
+        held = dict(arrays)
+    held[column] = held[column].copy()
+    held[column][5] = np.nextafter(held[column][5], 9e9) if column != "reset_s_m" else 1.0
+    np.savez(path, **held)
+    words = ("film", "run", "t-0", "--size", "320x180", "--speed", "4")
+    try:
+        until, beyond = (
+            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=desk),
+            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=desk),
+        )
+    finally:
+        path.write_bytes(kept)
+    assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
+    assert beyond.returncode == 2 and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
+    assert not list(desk.glob("beyond*"))
+    assert "of the same versions: of other code" in beyond.stderr
+
+
 def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None:
     """A film of another episode than the recorded one is no film of it: an error, and no file."""
     path = desk / "run" / "episodes" / "t-0" / "record.json"
@@ -88,7 +129,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
     record = json.loads(kept)
     path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
     try:
-        done = cosim("film", "run", "t-0", "--to", "0.2", "--size", "320x180", "-o", "wrong.mp4", cwd=desk)
+        done = cosim("film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk)
     finally:
         path.write_bytes(kept)
     assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
