@@ -6,6 +6,7 @@ import ast
 import mmap
 import os
 import re
+import shutil
 import struct
 import subprocess
 import sys
@@ -104,6 +105,26 @@ def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -
     python.chmod(0o755)
     assert Machine().runs(str(python)) == (wrong and f"'{python}' {wrong}")
     assert Machine().runs(str(tmp_path / "none")) == f"there is no '{tmp_path / 'none'}'"
+
+
+@pytest.mark.parametrize("verb", ["run", "test", "check", "bench"])
+def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
+    """Every verb of make that needs the packages first checks the machine: one error, and nothing is begun."""
+    make = shutil.which("make")
+    assert make is not None
+    for name in ("Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock", "cosim/machine.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    python = tmp_path / "python3.12"
+    python.write_text(f'#!/bin/sh\ncase "$*" in *-c*) echo 3.12;; *) exec {sys.executable} "$@";; esac\n')
+    python.chmod(0o755)
+    before = sorted(tmp_path.rglob("*"))
+    nothing_to_install_with = {**os.environ, "PATH": str(tmp_path)}
+    command = [make, "-j4", verb, f"PYTHON={python}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, env=nothing_to_install_with)
+    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("error: ") == 1
+    assert f"lacks Python 3.11 with venv ('{python}' is Python 3.12)" in done.stderr
+    assert sorted(tmp_path.rglob("*")) == before
 
 
 def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) -> None:
