@@ -12,6 +12,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_cros
 from cosim.cli_progress import doing
 from cosim.errors import unknown
 
+NONE = ("none: see below", "")
 out = Console()
 
 
@@ -102,13 +103,17 @@ def bench_cameras(rounds: int) -> None:
     head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
     table = Table(head, "frames/s", "spread", "target")
     for figure in FIGURES:
-        least = figure.least_fps[on_gpu]
-        cells = spread(found[figure.name]) if found[figure.name] else ("cannot be drawn here", "")
-        table.add_row(figure.name, *cells, "" if least is None else f">= {least:,.4g}")
+        least, fps = figure.least_fps[on_gpu], found[figure.name].fps
+        table.add_row(figure.name, *(spread(fps) if fps else NONE), "" if least is None else f">= {least:,.4g}")
     out.print(table)
     ratios = Table("ratio", "median", "spread", "target")
     for name, above, below, target in RATIOS:
-        values = [a / b for a, b in zip(found[above], found[below], strict=False)]
-        ratios.add_row(name, *(spread(values) if values else ("cannot be drawn here", "")), target)
+        values = [a / b for a, b in zip(found[above].fps, found[below].fps, strict=False)]
+        ratios.add_row(name, *(spread(values) if values else NONE), target)
     out.print(ratios)
     out.print(f"{drawn_by}; {rounds} rounds, medians", highlight=False)
+    wrong = {name: one.why for name, one in found.items() if one.why}
+    for name, why in wrong.items():
+        out.print(f"{name} cannot be drawn here: {why}", soft_wrap=True, markup=False, highlight=False)
+    if wrong:
+        out.print("What the machine lacks, and how to get it: `cosim doctor`.", highlight=False)

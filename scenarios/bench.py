@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import multiprocessing
 import resource
+import signal
 import statistics
 import tempfile
 import time
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from itertools import pairwise
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
 import msgspec
 
+from cosim.errors import EngineError
 from cosim.policies.route import Route
 from cosim.ports import Camera, CameraSpec, Crowd, Director, Manifest, Policy, World
 from cosim.scenario import City, CrowdSpec, Scenario
@@ -232,9 +235,34 @@ def measure(rounds: int, tell: Callable[[str], None]) -> Report:
 
 
 def alone(work: Callable[[Any], Any], size: float) -> Any:
-    """Run `work(size)` in a fresh process."""
-    with multiprocessing.get_context("spawn").Pool(1) as pool:
-        return pool.apply(work, (size,))
+    """Run `work(size)` in a fresh process. Raises what it raises there, EngineError when its process dies."""
+    context = multiprocessing.get_context("spawn")
+    mine, theirs = context.Pipe(duplex=False)
+    process = context.Process(target=_into, args=(theirs, work, size), daemon=True)
+    process.start()
+    theirs.close()
+    try:
+        found = mine.recv()
+    except EOFError:
+        process.join()
+        code = process.exitcode or 0
+        how = f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
+        raise EngineError(f"the process that draws or measures it {how}") from None
+    finally:
+        process.kill()
+        process.join()
+    if isinstance(found, Exception):
+        raise found
+    return found
+
+
+def _into(pipe: Connection, work: Callable[[Any], Any], size: float) -> None:
+    """Send what `work(size)` gives or raises."""
+    try:
+        found = work(size)
+    except Exception as error:  # noqa: BLE001  it is raised again where the work was given out
+        found = error
+    pipe.send(found)
 
 
 def spread(values: Sequence[float]) -> tuple[str, str]:

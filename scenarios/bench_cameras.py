@@ -9,12 +9,13 @@ from __future__ import annotations
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final, NamedTuple
 
 import numpy as np
 
+from cosim.errors import CosimError
 from cosim.geometry import Floats, Polyline, Pose
 from cosim.ports import CameraSpec
 from cosim.scenario import City
@@ -180,17 +181,27 @@ RATIOS: Final = (
 """What a ratio says, the figures above and below its line, what it should be."""
 
 
-def measure(rounds: int, tell: Callable[[str], None]) -> dict[str, list[float]]:
-    """Frames a second of every figure, `rounds` times, each in a fresh process; nothing where it cannot be drawn."""
-    from cosim.errors import EngineError
+class Found(NamedTuple):
+    """What came out of a figure: frames a second, round by round; why: what is wrong where there are none."""
+
+    fps: list[float]
+    why: str = ""
+
+
+def measure(rounds: int, tell: Callable[[str], None], figures: Sequence[Figure] = FIGURES) -> dict[str, Found]:
+    """Frames a second of every figure, `rounds` times, each in a fresh process. What fails is not tried again."""
     from scenarios.bench import alone
 
-    found: dict[str, list[float]] = {figure.name: [] for figure in FIGURES}
+    found = {figure.name: Found([]) for figure in figures}
     for i in range(rounds):
-        for figure in FIGURES:
+        for figure in figures:
+            if found[figure.name].why:
+                continue
             tell(f"round {i + 1} of {rounds}: {figure.name}")
             try:
-                found[figure.name].append(1.0 / alone(figure.work, figure.size_m))
-            except EngineError:
-                continue
+                found[figure.name].fps.append(1.0 / alone(figure.work, figure.size_m))
+            except CosimError as error:
+                found[figure.name] = Found([], str(error))
+            except Exception as error:  # noqa: BLE001  a library or a driver may fail in any way; it is told
+                found[figure.name] = Found([], f"{type(error).__name__}: {error}")
     return found
