@@ -127,6 +127,18 @@ def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
     assert sorted(tmp_path.rglob("*")) == before
 
 
+def test_make_without_any_python_says_which(tmp_path: Path) -> None:
+    """On a machine without any Python, make names the package and stops."""
+    make = shutil.which("make")
+    assert make is not None
+    shutil.copy(ROOT / "Makefile", tmp_path)
+    done = subprocess.run(
+        [make, "run"], cwd=tmp_path, capture_output=True, text=True, env={"PATH": str(tmp_path), "SHELL": "/bin/sh"}
+    )
+    assert done.returncode == 2 and "there is no python3.11. On Debian, as root: apt-get install" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["Makefile"]
+
+
 def test_a_library_is_looked_for_by_the_loader(monkeypatch: pytest.MonkeyPatch) -> None:
     """A library that every process has is found, one that cannot exist is not; one that lacks another is not blamed."""
     assert Machine().loads("libc.so.6") and not Machine().loads("libcosim-has-none.so.9")
