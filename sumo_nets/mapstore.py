@@ -23,7 +23,7 @@ from sumo_nets.atlas import street_map_of
 from sumo_nets.featurefile import NAME, read_features, with_features, write_features
 from sumo_nets.importer import Options, convert
 from sumo_nets.netfacts import read_facts
-from sumo_nets.netfile import net_content_hash
+from sumo_nets.nethash import net_content_hash
 from sumo_nets.store import cache_folder
 
 IMPORTER = 2

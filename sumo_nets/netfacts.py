@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import gzip
 import xml.etree.ElementTree as ET
-import zlib
 from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
 from math import hypot
@@ -17,6 +17,7 @@ from cosim.errors import MapError
 from cosim.mapcheck import STEEP, NetFacts
 from cosim.terrain import FALSE_GRADE
 from sumo_nets.netfile import going_on
+from sumo_nets.rawfile import net_bytes
 
 GO = frozenset("Gg")
 
@@ -34,13 +35,9 @@ def read_facts(path: Path) -> NetFacts:
 
 def net_root(path: Path) -> ET.Element:
     """The <net> element of a net on disk."""
+    data = net_bytes(path)
     try:
-        data = path.read_bytes()
-        root = ET.fromstring(gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data)
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (EOFError, zlib.error) as error:
-        raise MapError(f"{path}: broken gzip file: {error}") from error
+        root = ET.fromstring(data)
     except (ET.ParseError, LookupError, ValueError) as error:
         raise MapError(f"{path}: broken XML: {error}") from error
     if root.tag != "net":
@@ -99,11 +96,12 @@ def walks_of(root: ET.Element) -> Walks:
 def crossing_links(root: ET.Element) -> dict[str, tuple[str, int]]:
     """The traffic light and link index of each signalised crossing."""
     crossings = {e.get("id", "") for e in root.iter("edge") if e.get("function") == "crossing"}
-    return {
-        link.get("to", ""): (link.get("tl", ""), int(link.get("linkIndex", "0")))
-        for link in root.iter("connection")
-        if "tl" in link.attrib and link.get("to") in crossings
-    }
+    links = {}
+    for link in root.iter("connection"):
+        if "tl" in link.attrib and link.get("to") in crossings:
+            with _about(f"connection to '{link.get('to')}'"):
+                links[link.get("to", "")] = link.get("tl", ""), int(link.get("linkIndex", "0"))
+    return links
 
 
 def facts_of(root: ET.Element) -> NetFacts:
@@ -113,30 +111,31 @@ def facts_of(root: ET.Element) -> NetFacts:
     heights: list[float] = []
     levels: dict[str, float] = {}
     for edge in root.iter("edge"):
-        function = edge.get("function", "normal")
-        areas += function == "walkingarea"
-        crossings += function == "crossing"
-        if function == "walkingarea":
-            twisted += any(_twisted(lane.attrib["shape"]) for lane in edge.iter("lane"))
-        if function != "normal":
-            continue
-        normal += 1
-        for lane in edge.iter("lane"):
-            heights += [p[2] for p in _points(lane.attrib["shape"]) if len(p) > 2]
-        walked = footway(edge)
-        if walked is None:
-            continue
-        lane, kind = walked
-        length_m = float(lane.attrib["length"])
-        km[kind] += length_m / 1000.0
-        if kind == "mixed":
-            continue
-        missing += "width" not in lane.attrib
-        grade = _steepest(lane.attrib["shape"])
-        steep += grade > STEEP
-        false_grades += grade > FALSE_GRADE
-        if _off_ground(edge):
-            levels[edge.attrib["id"]] = length_m / 1000.0
+        with _about(f"edge '{edge.get('id', '')}'"):
+            function = edge.get("function", "normal")
+            areas += function == "walkingarea"
+            crossings += function == "crossing"
+            if function == "walkingarea":
+                twisted += any(_twisted(lane.attrib["shape"]) for lane in edge.iter("lane"))
+            if function != "normal":
+                continue
+            normal += 1
+            for lane in edge.iter("lane"):
+                heights += [p[2] for p in _points(lane.attrib["shape"]) if len(p) > 2]
+            walked = footway(edge)
+            if walked is None:
+                continue
+            lane, kind = walked
+            length_m = float(lane.attrib["length"])
+            km[kind] += length_m / 1000.0
+            if kind == "mixed":
+                continue
+            missing += "width" not in lane.attrib
+            grade = _steepest(lane.attrib["shape"])
+            steep += grade > STEEP
+            false_grades += grade > FALSE_GRADE
+            if _off_ground(edge):
+                levels[edge.attrib["id"]] = length_m / 1000.0
     walks = walks_of(root)
     location = root.find("location")
     return NetFacts(
@@ -162,6 +161,17 @@ def facts_of(root: ET.Element) -> NetFacts:
         levels=tuple(levels),
         levels_km=sum(levels.values()),
     )
+
+
+@contextmanager
+def _about(what: str) -> Iterator[None]:
+    """What is wrong is told with what it is about."""
+    try:
+        yield
+    except KeyError as error:
+        raise ValueError(f"{what}: attribute {error} is missing") from error
+    except ValueError as error:
+        raise ValueError(f"{what}: {error}") from error
 
 
 def _points(shape: str) -> list[list[float]]:

@@ -5,10 +5,8 @@ The reader streams the file once through expat and makes all polygons in a few v
 
 from __future__ import annotations
 
-import gzip
-import hashlib
+import math
 import re
-import zlib
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,7 +23,9 @@ from cosim.geometry import Floats
 from cosim.overlay import place_of
 from cosim.streetmap import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.elevation import land_of, steep_ports, steep_strips
+from sumo_nets.nethash import hash_of
 from sumo_nets.outlines import areas_of, bands, coordinates, polylines
+from sumo_nets.rawfile import DEEPEST, net_bytes
 from sumo_nets.seams import close_seams
 
 LANE_M = 3.2
@@ -35,19 +35,11 @@ GROUND = ("no", "", "building_passage")
 """What the params `bridge` and `tunnel` say of ways on the ground."""
 HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
 TRAMS = frozenset(("tram", "rail_urban"))
-SCHEMA = b"xsi:noNamespaceSchemaLocation"
+NEEDED = {"edge": ("id",), "lane": ("id", "shape"), "junction": ("id",), "connection": ("from", "to")}
+WIDEST_M = 500.0
+"""No lane and no square is wider."""
 
 Attributes = dict[str, str]
-
-
-def without_comments(net: bytes) -> bytes:
-    """A net's XML without comments: netconvert's hold the time, its version and the folders of the machine."""
-    return re.sub(rb"<!--.*?-->\s*", b"", net, flags=re.DOTALL) if b"<!--" in net else net
-
-
-def net_content_hash(path: Path) -> str:
-    """SHA-256 (16 hex digits) of what a net says: comments, schema location and line ends do not count."""
-    return _hash(_load(path))
 
 
 def read_net(path: Path) -> StreetMap:
@@ -55,10 +47,10 @@ def read_net(path: Path) -> StreetMap:
 
     Nets without sidewalks or walking areas are read too: their strips or corners are empty.
     """
-    data = _load(path)
+    data = net_bytes(path)
     raw = _parse(path, data)
     try:
-        return _street_map(path, raw, _hash(data))
+        return _street_map(path, raw, hash_of(data))
     except KeyError as error:
         raise MapError(f"{path}: not a street net that can be read: attribute {error} is missing") from error
     except MapError as error:
@@ -67,25 +59,6 @@ def read_net(path: Path) -> StreetMap:
         raise MapError(f"{path}: its ground{place_of(error)} cannot be put together: {error}") from error
     except (ValueError, IndexError) as error:
         raise MapError(f"{path}: not a street net that can be read: {error}") from error
-
-
-def _load(path: Path) -> bytes:
-    try:
-        data = path.read_bytes()
-        return gzip.decompress(data) if data[:2] == b"\x1f\x8b" else data
-    except OSError as error:
-        raise MapError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except (EOFError, zlib.error) as error:
-        raise MapError(f"{path}: broken gzip file: {error}") from error
-
-
-def _hash(data: bytes) -> str:
-    bare = without_comments(data)
-    # A search for the plain words is far quicker than the pattern that begins with white space.
-    if SCHEMA in bare:
-        pieces = re.split(SCHEMA + rb'="[^"]*"', bare)
-        bare = b"".join([piece.rstrip() for piece in pieces[:-1]] + pieces[-1:])
-    return hashlib.sha256(bare.replace(b"\r\n", b"\n").strip()).hexdigest()[:16]
 
 
 @dataclass(slots=True)
@@ -115,6 +88,10 @@ def _parse(path: Path, data: bytes) -> _Raw:
         stack.append(tag)
         if tag == "request":
             return
+        if len(stack) > DEEPEST:
+            raise ValueError(f"elements nested more than {DEEPEST} deep")
+        if lacking := [name for name in NEEDED.get(tag, ()) if name not in attributes]:
+            raise ValueError(f"<{tag}> '{attributes.get('id', '')}' lacks '{lacking[0]}'")
         if tag == "connection":
             # Only those to and from walking areas and crossings, which are internal edges, matter here.
             if attributes.get("from", "").startswith(":") or attributes.get("to", "").startswith(":"):
@@ -140,8 +117,12 @@ def _parse(path: Path, data: bytes) -> _Raw:
     parser.EndElementHandler = end
     try:
         parser.Parse(data, True)
-    except (expat.ExpatError, LookupError, ValueError) as error:
+    except (expat.ExpatError, LookupError) as error:
         raise MapError(f"{path}: broken XML: {error}") from error
+    except ValueError as error:
+        raise MapError(
+            f"{path}: not a street net that can be read: {error}: line {parser.CurrentLineNumber}"
+        ) from error
     if not raw.net:
         raise MapError(f"{path}: not a SUMO street net: it has no <net>")
     if not edges:
@@ -169,10 +150,8 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
                 driven.append((edge, lane, "verge" if _is_verge(lane) else "road"))
     left_hand = raw.net.get("lefthand") in ("true", "1")
     lanes = [lane for _, lane, _ in (*walk.values(), *driven)]
-    lines = polylines([lane["shape"] for lane in lanes])
-    widths = np.array([float(lane.get("width", LANE_M)) for lane in lanes])
-    if not np.isfinite(widths).all():
-        raise ValueError("a width that is not a number")
+    lines = polylines([lane["shape"] for lane in lanes], [lane["id"] for lane in lanes])
+    widths = np.array([_width_m(lane) for lane in lanes])
     # Foreign nets write -1 for SUMO's own width.
     widths[widths <= 0.0] = LANE_M
     polygons = bands(lines, widths)
@@ -222,6 +201,28 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     )
 
 
+def _width_m(lane: Attributes) -> float:
+    said = lane.get("width", LANE_M)
+    try:
+        width_m = float(said)
+    except ValueError:
+        width_m = math.nan
+    if math.isnan(width_m) or width_m > WIDEST_M:
+        words = f"a width of {width_m:g} m, but none is more than {WIDEST_M:g}" if width_m > WIDEST_M else "no number"
+        raise ValueError(f"lane '{lane['id']}': width '{said}' is {words}")
+    return width_m
+
+
+def _lane_of(link: Attributes, end: str) -> int:
+    """The number of the lane at an end, fromLane or toLane, of a connection."""
+    try:
+        return int(link.get(end, 0))
+    except ValueError as error:
+        raise ValueError(
+            f"connection from '{link['from']}' to '{link['to']}': {end} '{link[end]}' is no number"
+        ) from error
+
+
 def _allows(lane: Attributes, vehicle: str) -> bool:
     if "allow" in lane:
         return lane["allow"] == "all" or vehicle in lane["allow"].split()
@@ -255,7 +256,7 @@ def _corners(areas: dict[str, Attributes], links: Sequence[Attributes]) -> dict[
     for link in links:
         joined[link["from"]].add(link["to"])
         joined[link["to"]].add(link["from"])
-    flat, counts = coordinates([lane["shape"] for lane in areas.values()])
+    flat, counts = coordinates([lane["shape"] for lane in areas.values()], list(areas))
     corners: dict[str, Polygon | MultiPolygon] = {}
     rings = np.split(flat, np.cumsum(counts)[:-1])
     shapes = [shapely.polygons(ring) if len(ring) > 2 else None for ring in rings]
@@ -279,9 +280,9 @@ def _ports(
     signalised: set[str] = set()
     for link in links:
         tail, head = link["from"], link["to"]
-        if head in corners and tail in walk and int(link.get("fromLane", 0)) == walk[tail][2]:
+        if head in corners and tail in walk and _lane_of(link, "fromLane") == walk[tail][2]:
             ports.setdefault((tail, 1), head)
-        elif tail in corners and head in walk and int(link.get("toLane", 0)) == walk[head][2]:
+        elif tail in corners and head in walk and _lane_of(link, "toLane") == walk[head][2]:
             ports.setdefault((head, 0), tail)
         if "tl" in link and head in walk and head.startswith(":"):
             signalised.add(head)
@@ -355,7 +356,7 @@ def _driveways(points: str, line: Floats) -> tuple[float, ...]:
     """Arc lengths of a sidewalk's line beside points of its street's middle line."""
     if not points:
         return ()
-    at, _ = coordinates([points])
+    at, _ = coordinates([points], ["driveways"])
     return tuple(np.round(shapely.line_locate_point(shapely.linestrings(line), shapely.points(at)), 3).tolist())
 
 
@@ -363,7 +364,7 @@ def _junctions(rows: Sequence[Attributes]) -> dict[str, Junction]:
     outlined = [row for row in rows if row.get("type") != "internal" and row.get("shape", "").count(" ") > 1]
     if not outlined:
         return {}
-    flat, counts = coordinates([row["shape"] for row in outlined])
+    flat, counts = coordinates([row["shape"] for row in outlined], [row["id"] for row in outlined])
     shapes = [shapely.polygons(ring) for ring in np.split(flat, np.cumsum(counts)[:-1])]
     junctions: dict[str, Junction] = {}
     for row, shape in zip(outlined, shapely.make_valid(np.array(shapes, dtype=object)), strict=True):

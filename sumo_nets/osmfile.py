@@ -5,28 +5,25 @@ netconvert reads neither bz2 nor PBF, and says so in riddles; here every file en
 
 from __future__ import annotations
 
-import bz2
-import gzip
-import lzma
-import zlib
-from collections.abc import Callable
+import math
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Literal, Protocol
+from typing import Literal, Protocol
 from xml.parsers import expat
 
 import numpy as np
 
 from cosim.errors import MapError
+from sumo_nets.rawfile import BLANK, LARGEST_BYTES, head_of, parse, pour, root_of
 
-LARGEST_BYTES = 2 * 1024**3
-"""A file that unpacks to more than this is refused: cut the area out first."""
-
-PIECE_BYTES = 1 << 20
 READABLE = "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can be read"
 ON_FOOT = frozenset(("footway", "path", "pedestrian", "steps", "living_street", "track", "cycleway", "bridleway"))
 FAST = frozenset(("motorway", "motorway_link", "trunk", "trunk_link"))
 NO_STREET = frozenset(("construction", "proposed", "raceway", "bus_guideway", "platform", "rest_area", "services"))
+
+MOST_LANES, WIDEST_M = 40, 200
+NUMBER = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?")
 
 Format = Literal["net", "osm"]
 
@@ -59,21 +56,15 @@ class OsmFacts:
 
 def unpacked(source: Path, folder: Path) -> MapFile:
     """`source` as plain XML inside `folder`. Raises MapError naming what was found when it is no map."""
-    try:
-        with source.open("rb") as file:
-            head = file.read(64)
-    except OSError as error:
-        raise MapError(f"{source}: cannot be read: {error.strerror}") from error
+    head = head_of(source)
     if not head:
         raise MapError(f"{source}: the file is empty; {READABLE}")
     packing, plain = _packing(source, head), folder / "unpacked.xml"
-    try:
-        UNPACKERS[packing](source, plain)
-    except (EOFError, zlib.error, lzma.LZMAError) as error:
-        raise MapError(f"{source}: broken {packing} file, probably cut short: {error}: get it again") from error
-    except (OSError, RuntimeError, ValueError) as error:
-        raise MapError(f"{source}: cannot be unpacked ({packing or 'plain'}): {error}") from error
-    kind = _root(source, plain)
+    if packing == "PBF":
+        _pbf(source, plain)
+    else:
+        pour(source, packing, plain)
+    kind = _kind(source, plain)
     path = folder / ("input.net.xml" if kind == "net" else "input.osm")
     plain.rename(path)
     return MapFile(source, path, kind, packing)
@@ -86,73 +77,33 @@ def _packing(source: Path, head: bytes) -> str:
         return "bzip2"
     if b"OSMHeader" in head:
         return "PBF"
-    if head.lstrip(b"\xef\xbb\xbf\xff\xfe\x00 \t\r\n")[:1] == b"<":
+    if head.lstrip(BLANK)[:1] == b"<":
         return ""
     known = {b"PK": "a zip archive", b"\xfd7zXZ": "an xz file", b"7z\xbc\xaf": "a 7z archive", b"(\xb5/\xfd": "zstd"}
     found = next((what for magic, what in known.items() if head.startswith(magic)), f"bytes {head[:8]!r}")
     raise MapError(f"{source}: neither XML nor a known compression: found {found}; unpack it first; {READABLE}")
 
 
-def _plain(source: Path, target: Path) -> None:
-    with source.open("rb") as stream:
-        _pour(source, stream, target)
-
-
-def _gzip(source: Path, target: Path) -> None:
-    with gzip.open(source, "rb") as stream:
-        _pour(source, stream, target)
-
-
-def _bzip2(source: Path, target: Path) -> None:
-    with bz2.open(source, "rb") as stream:
-        _pour(source, stream, target)
-
-
 def _pbf(source: Path, target: Path) -> None:
     import osmium
 
     osm = target.with_suffix(".osm")
-    with osmium.SimpleWriter(str(osm), overwrite=True) as writer:
-        for thing in osmium.FileProcessor(str(source)):
-            writer.add(thing)
+    try:
+        with osmium.SimpleWriter(str(osm), overwrite=True) as writer:
+            for thing in osmium.FileProcessor(str(source)):
+                writer.add(thing)
+    except (OSError, RuntimeError, ValueError) as error:
+        raise MapError(f"{source}: cannot be unpacked (PBF): {error}: get it again") from error
+    if osm.stat().st_size > LARGEST_BYTES:
+        raise MapError(f"{source}: more than {LARGEST_BYTES >> 30} GiB unpacked: cut the area of interest out first")
     osm.rename(target)
 
 
-UNPACKERS: dict[str, Callable[[Path, Path], None]] = {"": _plain, "gzip": _gzip, "bzip2": _bzip2, "PBF": _pbf}
-
-
-def _pour(source: Path, stream: IO[bytes] | gzip.GzipFile | bz2.BZ2File, target: Path) -> None:
-    size = 0
-    with target.open("wb") as out:
-        while piece := stream.read(PIECE_BYTES):
-            size += len(piece)
-            if size > LARGEST_BYTES:
-                gib = LARGEST_BYTES >> 30
-                raise MapError(f"{source}: more than {gib} GiB unpacked: cut the area of interest out first")
-            out.write(piece)
-
-
-class _Found(Exception):
-    """The root element is known; the rest is not read."""
-
-
-def _root(source: Path, plain: Path) -> Format:
-    found: list[str] = []
-
-    def start(tag: str, _attributes: dict[str, str]) -> None:
-        found.append(tag)
-        raise _Found
-
-    parser = expat.ParserCreate()
-    parser.StartElementHandler = start
+def _kind(source: Path, plain: Path) -> Format:
     try:
-        with plain.open("rb") as file:
-            parser.ParseFile(file)
-    except _Found:
-        pass
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        raise MapError(f"{source}: broken XML: {error}; {READABLE}") from error
-    tag = found[0] if found else ""
+        tag = root_of(plain)
+    except ValueError as error:
+        raise MapError(f"{source}: broken XML: {error}") from error
     if tag in ("net", "osm"):
         return "net" if tag == "net" else "osm"
     raise MapError(f"{source}: not a map: its root element is <{tag}>, not <net> or <osm>; {READABLE}")
@@ -174,7 +125,7 @@ class _Scan:
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if tag == "node":
-            self.lonlat.append((float(attributes["lon"]), float(attributes["lat"])))
+            self.lonlat.append(_lonlat(attributes))
         elif tag == "way":
             self.way, self.tags = attributes["id"], {}
         elif tag == "tag" and self.way is not None:
@@ -187,6 +138,8 @@ class _Scan:
             return
         self.ways += 1
         highway = self.tags.get("highway", "")
+        if highway:
+            _check_numbers(self.way, self.tags)
         if highway in ON_FOOT:
             self.on_foot += 1
         elif highway and highway not in NO_STREET:
@@ -196,6 +149,30 @@ class _Scan:
             if tagged:
                 self.tagged.add(self.way)
         self.way = None
+
+
+def _lonlat(node: dict[str, str]) -> tuple[float, float]:
+    try:
+        lon, lat = float(node["lon"]), float(node["lat"])
+    except ValueError:
+        lon = lat = math.nan
+    if not (math.isfinite(lon) and math.isfinite(lat)):
+        raise ValueError(f"node {node.get('id')} lies nowhere: lon={node['lon'][:40]} lat={node['lat'][:40]}")
+    return lon, lat
+
+
+def _check_numbers(way: str, tags: dict[str, str]) -> None:
+    """Raises ValueError for lanes and widths that no street has: netconvert would build them for ever."""
+    for key, said in tags.items():
+        words = key.split(":")
+        if words[0] == "lanes":
+            most = MOST_LANES
+        elif "width" in (words[0], words[-1]):
+            most = WIDEST_M
+        else:
+            continue
+        if any(float(number) > most for number in NUMBER.findall(said)):
+            raise ValueError(f"way {way}: {key}={said[:40]}, but no street has more than {most}: mend the tag")
 
 
 class Elements(Protocol):
@@ -210,11 +187,7 @@ def scanned(file: MapFile, elements: Elements) -> None:
     parser = expat.ParserCreate()
     parser.StartElementHandler, parser.EndElementHandler = elements.start, elements.end
     try:
-        with file.path.open("rb") as stream:
-            parser.ParseFile(stream)
-    except (expat.ExpatError, LookupError) as error:
-        said = f"attribute {error} is missing" if isinstance(error, KeyError) else str(error)
-        raise MapError(f"{file.source}: broken OpenStreetMap file: {said}: get it again") from error
+        parse(parser, file.path)
     except ValueError as error:
         raise MapError(f"{file.source}: broken OpenStreetMap file: {error}: get it again") from error
 

@@ -17,7 +17,7 @@ from cosim.scenario import City
 from sumo_nets.blocks import CLASSES, Point
 from sumo_nets.city import plan_city
 from sumo_nets.netconvert import netconvert
-from sumo_nets.netfile import net_content_hash, without_comments
+from sumo_nets.nethash import net_content_hash, without_comments
 from sumo_nets.plan import CityPlan, Edge
 from sumo_nets.signals import with_programs
 

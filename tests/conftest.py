@@ -32,6 +32,10 @@ settings.register_profile(
 settings.load_profile("tests")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--whole", action="store_true", help="all damaged files, where a sample is tested by default")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them."""
     made_by = hashlib.sha256(f"{version('eclipse-sumo')} {version('numpy')}".encode())

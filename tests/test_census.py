@@ -21,7 +21,8 @@ from cosim.streetmap import WalkableArea
 from cosim.walks import WalkGraph
 from sumo_nets.census import BLOCKS, ZONES, _shape, census, clear_width_m, longest_walk_m
 from sumo_nets.city import STYLES
-from sumo_nets.netfile import net_content_hash, read_net
+from sumo_nets.netfile import read_net
+from sumo_nets.nethash import net_content_hash
 from sumo_nets.seeds import SEEDS, shipped_cities
 from sumo_nets.signals import signal_faults
 from sumo_nets.store import build_city, city_net, is_whole, write_city

@@ -19,7 +19,8 @@ from cosim.streetmap import StreetMap
 from sumo_nets.blocks import CLASSES, STRIPE_M, corner, curve, direction, length, ring, s_bend, split
 from sumo_nets.city import STYLES, plan_city
 from sumo_nets.netconvert import netconvert
-from sumo_nets.netfile import net_content_hash, read_net
+from sumo_nets.netfile import read_net
+from sumo_nets.nethash import net_content_hash
 from sumo_nets.plan import CityPlan
 from sumo_nets.signals import signal_faults
 from sumo_nets.store import build_city, city_net

@@ -207,7 +207,7 @@ def test_a_net_says_itself_where_it_drives(tmp_path: Path) -> None:
         pytest.param("a.osm", b"hello", "neither XML nor a known compression", id="text"),
         pytest.param("a.osm", b"PK\x03\x04rest", "a zip archive", id="zip"),
         pytest.param("a.osm", b"<html><body/></html>", "its root element is <html>", id="html"),
-        pytest.param("a.osm", b"<osm><node", "broken OpenStreetMap file", id="cut short"),
+        pytest.param("a.osm", b"<osm><node", "broken XML", id="cut short"),
         pytest.param("a.osm", b"<osm/>", "none of them a street or path", id="no street"),
         pytest.param("a.osm", osm((4.4e5, 5.8e6)).encode(), "reproject it to WGS 84", id="metres"),
         pytest.param(
@@ -248,7 +248,7 @@ def test_missing_files_and_bad_names_are_refused(tmp_path: Path) -> None:
     """A file that is not there, a name that is no name, a name that SUMO's nets have, a box that is none."""
     with pytest.raises(MapError, match="cannot be read: No such file"):
         import_map(tmp_path / "none.osm")
-    with pytest.raises(MapError, match="cannot be read: Is a directory"):
+    with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
         import_map(tmp_path)
     with pytest.raises(UsageError, match="cannot name a map"):
         import_map(tmp_path / "a.osm", "../a")

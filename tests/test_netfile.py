@@ -10,7 +10,8 @@ import pytest
 
 from cosim.errors import MapError
 from cosim.streetmap import Port
-from sumo_nets.netfile import net_content_hash, read_net
+from sumo_nets.netfile import read_net
+from sumo_nets.nethash import net_content_hash
 
 NET = """<?xml version="1.0" encoding="UTF-8"?>
 <!-- generated on 2020-01-01 in /somewhere -->
@@ -164,13 +165,20 @@ def test_stubs_of_no_length_become_tiny_strips(tmp_path: Path) -> None:
         (NET[:900], "broken XML"),
         ("<routes/>", "not a SUMO street net: it has no <net>"),
         ('<net version="1.20"></net>', "the street net has no edges: nothing walkable here"),
-        (NET.replace("58,1.6 108,1.6", "58,north 108,1.6"), "could not convert string to float: 'north'"),
+        (
+            NET.replace("58,1.6 108,1.6", "58,north 108,1.6"),
+            "'path_0': a shape with points that are not x,y in metres: '58,north'",
+        ),
         (NET.replace("58,1.6 108,1.6", "58 108,1.6"), "points that are not x,y"),
         (NET.replace("58,1.6 108,1.6", "nan,1.6 108,1.6"), "points that are not x,y"),
+        (NET.replace("58,1.6 108,1.6", "58,1.6 108,1e300"), "'path_0': a shape with points that are not x,y"),
         (NET.replace("58,1.6 108,1.6", ""), "a shape without points"),
-        (NET.replace('<edge id="in"', '<edge name="in"'), "attribute 'id' is missing"),
+        (NET.replace('<edge id="in"', '<edge name="in"'), "<edge> '' lacks 'id': line 15"),
         (NET.replace("UTF-8", "klingon"), "broken XML: unknown encoding"),
-        (NET.replace('width="3.20"', 'width="wide"'), "could not convert string to float: 'wide'"),
+        (NET.replace('width="3.20"', 'width="wide"'), "lane ':J_c0_0': width 'wide' is no number"),
+        (NET.replace('width="3.20"', 'width="1e9"'), "lane ':J_c0_0': width '1e9' is a width of 1e+09 m"),
+        (NET.replace('fromLane="0"', 'fromLane="x"'), "connection from 'in' to ':J_w0': fromLane 'x' is no number"),
+        (NET.replace("<lane id", "<a>" * 50 + "<lane id", 1), "nested more than 40 deep: line 5"),
     ],
 )
 def test_broken_nets_are_refused_with_file_and_reason(tmp_path: Path, text: str, reason: str) -> None:
@@ -185,7 +193,7 @@ def test_unreadable_files_are_refused(tmp_path: Path) -> None:
     """A missing file, a folder and a truncated gzip are MapErrors too."""
     with pytest.raises(MapError, match="cannot be read: No such file"):
         read_net(tmp_path / "none.net.xml")
-    with pytest.raises(MapError, match="cannot be read: Is a directory"):
+    with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
         net_content_hash(tmp_path)
     cut = tmp_path / "cut.net.xml.gz"
     cut.write_bytes(gzip.compress(NET.encode())[:200])
