@@ -114,6 +114,7 @@ def run(
     from physics.cameras import renderer_of
     from scenarios.catalog import chosen, with_crowd
     from scenarios.catalog import suite as shipped
+    from scenarios.pace import announcement, remembered
     from scenarios.pool import run_all
 
     if map_name is not None:
@@ -158,9 +159,12 @@ def run(
         todo = [s for s in picked if s.id not in done]
         if done:
             err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
-        board = Board(len(picked), len(done), {s.id: s.route_line.length_m for s in picked})
+        if todo:
+            words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
+            err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
+        board = Board(picked, done, compared=counterfactual)
         try:
-            with board.bars:
+            with board.bars, remembered(held, todo, jobs):
                 tell = board.tell
                 run_all(
                     held,

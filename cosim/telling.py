@@ -12,9 +12,9 @@ class Tell(Protocol):
 
 
 def duration(seconds: float) -> str:
-    """A time in words, no finer than is known: 45 s, 12 min, 2 h 10 min."""
-    if seconds < 59.5:
-        return f"{seconds:.0f} s"
+    """A time in words, no finer than is known: 45 s, 90 s, 12 min, 2 h 10 min."""
+    if seconds < 115.0:
+        return f"{round(seconds, -1) if seconds >= 60.0 else seconds:.0f} s"
     minutes = round(seconds / 60.0)
     if minutes < 60:
         return f"{minutes} min"

@@ -33,7 +33,7 @@ def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
 
 def test_what_is_left_is_said_when_it_is_known() -> None:
     """A tenth took ten seconds: a minute and a half is left; of the first moments nothing is concluded."""
-    assert in_words("filming", 0.1, 10.0) == "filming: 10 %, about 2 min left"
+    assert in_words("filming", 0.1, 10.0) == "filming: 10 %, about 90 s left"
     assert in_words("filming", 0.5, 10.0) == "filming: 50 %, about 10 s left"
     assert in_words("filming", 0.01, 10.0) == "filming: 1 %" and in_words("filming", 0.5, 1.0) == "filming: 50 %"
     assert in_words("filming", None, 10.0) == "filming"
@@ -41,9 +41,17 @@ def test_what_is_left_is_said_when_it_is_known() -> None:
 
 @pytest.mark.parametrize(
     ("seconds", "words"),
-    [(0.2, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3570.0, "1 h"), (4000.0, "1 h 7 min"), (23400.0, "6 h 30 min")],
+    [
+        (0.2, "0 s"),
+        (59.4, "59 s"),
+        (74.0, "70 s"),
+        (116.0, "2 min"),
+        (3570.0, "1 h"),
+        (4000.0, "1 h 7 min"),
+        (23400.0, "6 h 30 min"),
+    ],
     ids=lambda value: str(value).replace(" ", "-"),
-)
+)  # fmt: skip
 def test_a_time_is_said_no_finer_than_it_is_known(seconds: float, words: str) -> None:
-    """Seconds below a minute, minutes below two hours, then tens of minutes."""
+    """Seconds, tens of seconds, minutes, tens of minutes: below one, two, 120 minutes and above."""
     assert duration(seconds) == words
