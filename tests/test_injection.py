@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import re
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +22,7 @@ from cosim.injection import Ack, Injected, Injection
 from cosim.scenario import City, CrowdSpec, Suite, write_suite
 from cosim.walks import WalkGraph
 from scenarios.guests import MOST_GUESTS, Guests
+from tests.conftest import PATIENCE_S, Cosim
 
 TICK_MS = 50
 
@@ -180,16 +180,18 @@ from cosim.state import Command
 class Slow:
     manifest = Manifest("slow", rate_hz=20.0, camera=CameraSpec(64, 64))
     def reset(self, scenario_id, seed):
-        pass
+        self.count = 0
     def act(self, observation):
         if Path("enough").exists():
             return Command(1.5, 0.6)  # off the sidewalk: that ends the episode
-        time.sleep(0.02)
-        return Command(0.1, 0.0)
+        time.sleep(0.05)
+        self.count += 1
+        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro, for as long as it takes
 """
 
-CONNECTED = """
+CONNECTED = f"""
 import json, sys, threading, zenoh
+PATIENCE_S = {PATIENCE_S}
 config = zenoh.Config()
 config.insert_json5("mode", '"client"')
 config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
@@ -205,7 +207,7 @@ def hear(sample):
 with zenoh.open(config) as session:
     subscriber = session.declare_subscriber("cosim/**", hear)
     print("listening", flush=True)
-    ended.wait(60)
+    ended.wait(PATIENCE_S)
 print(json.dumps(heard))
 """
 
@@ -215,7 +217,8 @@ done = threading.Semaphore(0)
 acks = []
 with zenoh.open(config) as session:
     def ask(key, payload=b""):
-        return next(((r.ok or r.err).payload.to_bytes() for r in session.get(key, payload=payload, timeout=20)), b"")
+        replies = session.get(key, payload=payload, timeout=PATIENCE_S)
+        return next(((r.ok or r.err).payload.to_bytes() for r in replies), b"")
     def said(message, key=f"{below}/inject"):
         return ask(key, message).decode(errors="replace")
     bad = {
@@ -231,11 +234,11 @@ with zenoh.open(config) as session:
     many = 2000
     for i in range(many):
         message = json.dumps({"id": f"p{i}", "path": [[x, y]]})
-        took = zenoh.handlers.Callback(lambda r: acks.append(json.loads(r.ok.payload.to_string())), drop=done.release)
-        session.get(f"{below}/inject", took, payload=message, timeout=60)
+        took = zenoh.handlers.Callback(lambda r: acks.append(r.ok and r.ok.payload.to_string()), drop=done.release)
+        session.get(f"{below}/inject", took, payload=message, timeout=PATIENCE_S)
     for _ in range(many):
         done.acquire()
-    bad["flood"] = [len(acks), sum(ack["status"] == "accepted" for ack in acks)]
+    bad["flood"] = [json.loads(ack) for ack in acks if ack]
     bad["log"] = json.loads(ask(f"{below}/log"))
     bad["camera"] = ask(f"{below}/camera").hex()[:16]
 print(json.dumps(bad))
@@ -251,31 +254,22 @@ class OnAir(NamedTuple):
     way: list[tuple[float, float]]
 
     def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return subprocess.run(
-            [sys.executable, *arguments], cwd=self.folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=100
-        )
-
-    def cosim(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        return self.python("-m", "cosim", *arguments)
-
-    def until(self, *arguments: str) -> subprocess.CompletedProcess[str]:
-        """What a command says once it succeeds: the run may have to start first."""
-        for _ in range(60):
-            said = self.python(*arguments)
-            if said.returncode == 0:
-                break
-            time.sleep(0.3)
-        assert said.returncode == 0, said.stderr
-        return said
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
 
     def record(self) -> dict[str, Any]:
         """The record, when the episode has been told to end."""
         (self.folder / "enough").touch()
-        assert self.run.wait(timeout=60) == 0
+        assert self.run.wait(timeout=PATIENCE_S) == 0
         return json.loads((self.folder / "run" / "episodes" / "t-0" / "record.json").read_bytes())
 
 
-ENVIRONMENT = os.environ | {"COLUMNS": "160", "NO_COLOR": "1"}
+def once(what: Callable[[], bool]) -> None:
+    """Wait until something is so: who asks a busy run may get no answer at first."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.3)
 
 
 @contextmanager
@@ -288,12 +282,12 @@ def on_air(folder: Path) -> Iterator[OnAir]:
     _, street_map = place(city)
     whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
-    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=120.0, ends_on_failure=True, events=())
+    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=())
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
     (folder / "slow.py").write_text(SLOW)
     at = f"unixsock-stream/{folder}/air.sock"
     words = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "slow:Slow", "--camera", "bullet"]
-    with subprocess.Popen([*words, "--out", "run", "--live", at], cwd=folder, env=ENVIRONMENT, text=True) as run:
+    with subprocess.Popen([*words, "--out", "run", "--live", at], cwd=folder, text=True) as run:
         try:
             yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
         finally:
@@ -301,33 +295,43 @@ def on_air(folder: Path) -> Iterator[OnAir]:
 
 
 @pytest.mark.engine
-def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path) -> None:
+def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path, cosim: Cosim) -> None:
     """`cosim inject` beside `cosim run --live`; `cosim replay` comes to the same state hash, given the injection."""
     with on_air(tmp_path) as air:
+        there = ("--connect", air.at, "--wait", str(PATIENCE_S))
         message = json.dumps({"id": "anna", "path": [air.way[0], air.way[-1]], "doing": "stop"})
-        sent = air.until("-m", "cosim", "inject", message, "--connect", air.at)
-        assert "'anna' enters at tick" in sent.stdout
-        again = air.cosim("inject", message, "--connect", air.at)
+        sent = cosim("inject", message, *there)
+        assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
+        again = cosim("inject", message, *there)
         assert again.returncode == 2 and "of this id" in again.stderr
-        elsewhere = air.cosim("inject", message, "--connect", air.at, "--env", "run/t-9")
-        assert elsewhere.returncode == 2 and "Valid choices: run/t-0" in elsewhere.stderr
-        told = air.cosim("listen", "events", "--connect", air.at, "--seconds", "0.5")
-        assert json.loads(told.stdout.splitlines()[0])["injections"][0]["injection"]["id"] == "anna"
-        heard = air.cosim("listen", "robot", "--connect", air.at, "--seconds", "1")
-        assert len(heard.stdout.splitlines()) > 3 and "x_m" in json.loads(heard.stdout.splitlines()[0])
+        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9")
+        once(lambda: "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr and said.returncode == 2)
+
+        def in_the_log() -> list[str]:
+            told = cosim("listen", "events", *there, "--seconds", "0")
+            assert told.returncode == 0, told
+            return [one["injection"]["id"] for one in json.loads(told.stdout.splitlines()[0])["injections"]]
+
+        once(lambda: in_the_log() == ["anna"])
+        words = [sys.executable, "-m", "cosim", "listen", "robot", *there]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
+            assert listener.stdout is not None
+            ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
+            listener.terminate()
+        assert listener.returncode == 130 and all("x_m" in tick for tick in ticks)
         record = air.record()
     assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
-    replayed = air.cosim("replay", "run", "t-0")
+    replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
     assert "replaying t-0 ..." in replayed.stderr
     without = json.dumps(record | {"injections": []})
     (tmp_path / "run" / "episodes" / "t-0" / "record.json").write_text(without)
-    differs = air.cosim("replay", "run", "t-0")
+    differs = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert differs.returncode == 2 and "not the same" in differs.stderr
 
 
 @pytest.mark.engine
-def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path) -> None:
+def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, cosim: Cosim) -> None:
     """The README's script injects, one who comes late hears all topics and gets the log, nonsense and floods bounce."""
     readme = (Path(__file__).parents[1] / "README.md").read_text()
     found = re.search(r"```python\n(import json, zenoh\n.*?)```", readme, re.DOTALL)
@@ -336,7 +340,8 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path) -
         script = found[1].replace("tcp/127.0.0.1:7447", air.at)
         script = script.replace("[170, 252], [190, 252]", json.dumps([air.way[0], air.way[-1]])[1:-1])
         (tmp_path / "ten.py").write_text(script)
-        bob = json.loads(air.until("ten.py").stdout)
+        assert cosim("listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0").returncode == 0
+        bob = json.loads(air.python("ten.py").stdout)
         words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
         with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
             assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
@@ -353,14 +358,20 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path) -
     }.items():  # fmt: skip
         assert words in said[name], said[name]
     assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
-    answered, accepted = said["flood"]
-    assert answered == 2000 and accepted == MOST_GUESTS - 1
-    assert said["log"]["injections"][0]["injection"]["id"] == "bob"
+    taken_in = [one["injection"]["id"] for one in record["injections"]]
+    for ack in said["flood"]:
+        assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
+        assert ack["status"] == "accepted" or "are here already" in ack["reason"]
+    assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
+    assert len(taken_in) == len(set(taken_in)) >= MOST_GUESTS
+    assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
+    guests = [sum(one["id"].startswith("ei-") for one in crowd) for crowd in heard["crowd"]]
+    assert MOST_GUESTS // 2 < max(guests) <= MOST_GUESTS
     assert (
         set(heard) == {"clock", "robot", "crowd", "signals", "events"} and heard["events"][-1][-1] == "ended: failure"
     )
     assert heard["clock"][-1]["tick"] > bob["tick"]
     assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)
-    assert record["status"] == "done" and len(record["injections"]) == accepted + 1
-    replayed = air.cosim("replay", "run", "t-0")
+    assert record["status"] == "done"
+    replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
