@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +11,7 @@ from cosim.events import Event, Kind
 from cosim.record import Log, Record
 from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.eventsheet import COLUMNS, rows_of, summary
+from tests.conftest import Cosim
 
 TICK_S = 0.05
 
@@ -76,7 +74,7 @@ def test_a_late_trigger_is_counted() -> None:
 
 
 @pytest.mark.engine
-def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path) -> None:
+def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path, cosim: Cosim) -> None:
     """--event takes those alone, an unknown one is answered with those there are, --events shows what was measured."""
     from cosim.walks import WalkGraph
     from scenarios.assemble import place
@@ -92,16 +90,12 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path
         made.append(Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields))
     write_suite(Suite(name="tiny", version="1", scenarios=tuple(made)), tmp_path / "tiny.json")
 
-    def cosim(*words: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "cosim", *words]
-        about = os.environ | {"COLUMNS": "170", "NO_COLOR": "1"}
-        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, env=about)
-
-    run = cosim("run", "tiny.json", "--event", "gesturing", "--policy", "orca", "--out", "mine")
+    words = ("run", "tiny.json", "--event", "gesturing", "--policy", "orca", "--out", "mine")
+    run = cosim(*words, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
     assert "scheduled 1, finished 1" in run.stdout
-    shown = cosim("show", "mine", "--events")
+    shown = cosim("show", "mine", "--events", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "gesturing" in shown.stdout and "frontal" not in shown.stdout and "trigger m" in shown.stdout
-    wrong = cosim("run", "tiny.json", "--event", "frontl")
+    wrong = cosim("run", "tiny.json", "--event", "frontl", cwd=tmp_path)
     assert wrong.returncode == 2 and "event 'frontl'" in wrong.stderr and "frontal, gesturing" in wrong.stderr

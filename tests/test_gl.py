@@ -59,7 +59,7 @@ def off_edges(*labels: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("city", CITIES, ids=lambda city: city.name)
 def test_both_cameras_see_the_same(city: City) -> None:
-    """Over 25 views of a city labels agree on 97 % of the pixels off edges, and depth to 2 cm in the median."""
+    """In 25 views from five places of a city labels agree on 97 % of the pixels off edges, and depth to 2 cm."""
     _, street_map = place(city)
     rng = np.random.default_rng(city.seed)
     strips = [s for s in street_map.strips.values() if s.length_m > 5.0]
@@ -67,10 +67,11 @@ def test_both_cameras_see_the_same(city: City) -> None:
     x, y = crossing.line[0]
     fence = Barrier(x_m=float(x), y_m=float(y), heading_rad=0.3, length_m=2.0, strip=crossing.id, end=0)
     world = BulletWorld(street_map, city.seed, [fence])
-    agree, depths = [], []
+    agree, depths, strip = [], [], crossing
     with GlCamera(world, SPEC, depth=True) as one, BulletCamera(world, SPEC, depth=True) as other:
         for i in range(25):
-            strip = crossing if i == 0 else strips[int(rng.integers(len(strips)))]
+            if i and not i % 5:
+                strip = strips[int(rng.integers(len(strips)))]
             robot = stand_at(world, strip, float(rng.uniform(0.1, 0.9)), float(rng.uniform(-math.pi, math.pi)))
             street = street_at(street_map, robot.pose.xy, rng)
             a, b = one.render(robot, street), other.render(robot, street)

@@ -6,8 +6,6 @@ import bz2
 import gzip
 import json
 import re
-import subprocess
-import sys
 import time
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -32,6 +30,7 @@ from sumo_nets.netfacts import read_facts, walks_of
 from sumo_nets.netfile import read_net
 from sumo_nets.signalcheck import mend_signals
 from sumo_nets.store import build_city
+from tests.conftest import Cosim
 
 MAPS = Path(__file__).parents[2] / "shared" / "maps"
 NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
@@ -334,26 +333,21 @@ def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> No
 
 
 @pytest.mark.engine
-def test_command_line(tmp_path: Path) -> None:
-    """import and check, their output and exit codes, run as a user would."""
+def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
+    """import and check, their output and exit codes."""
     source, picture = written(tmp_path / "town.osm", osm()), tmp_path / "town.png"
-
-    def cosim(*words: str | Path) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "cosim", "map", *map(str, words)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
-
-    done = cosim("import", source, "--name", "town")
+    done = cosim("map", "import", str(source), "--name", "town")
     assert done.returncode == 0 and "long-horizon scenarios possible" in done.stdout, done.stderr
     assert "converting " in done.stderr and "checking town ..." in done.stderr
-    done = cosim("check", "town", "--json", "-o", picture, "--zoom", "0,0,100,100")
+    done = cosim("map", "check", "town", "--json", "-o", str(picture), "--zoom", "0,0,100,100")
     assert done.returncode == 0 and json.loads(done.stdout)["check"]["corners"] > 10
     assert picture.read_bytes().startswith(b"\x89PNG")
-    done = cosim("check", "nowhere")
+    done = cosim("map", "check", "nowhere")
     assert done.returncode == 2 and "unknown map 'nowhere'" in done.stderr
     cars = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
-    done = cosim("check", cars)
+    done = cosim("map", "check", str(cars))
     assert done.returncode == 2 and "NOT USABLE" in done.stdout
-    done = cosim("import", cars)
+    done = cosim("map", "import", str(cars))
     assert done.returncode == 2 and "--upgrade" in done.stderr and "Traceback" not in done.stderr
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import math
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 from shapely.geometry import box
@@ -19,7 +20,7 @@ from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
 from cosim.policies.route import crossing_limit
 from cosim.ports import Observation, Privileged
-from cosim.scenario import City
+from cosim.scenario import City, CrowdSpec
 from cosim.state import NO_VEHICLES, Doing, People, RobotState, Signal, Vehicles
 
 CITY = City(seed=1, size_m=500.0)
@@ -133,7 +134,8 @@ def test_the_reference_solver_solves_every_event(kind: Kind, seed: int) -> None:
     from scenarios.run import episode
 
     _, street_map = place(CITY)
-    scenario = build(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
+    whole = build(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
+    scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
     record = episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
     assert record.measures["success"] == 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,24 +24,22 @@ from cosim.streetmap import Port, StreetMap, Strip, WalkableArea
 from cosim.wayline import way_line
 from physics.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
 from physics.world import BulletWorld
-from sumo_nets.netfile import read_net
-from sumo_nets.store import build_city
+from sumo_nets.atlas import street_map_of
+from sumo_nets.store import city_net
 
 pytestmark = pytest.mark.engine
 
 CITIES = (City(seed=11, size_m=600.0), City(seed=23, size_m=600.0, style="suburb"))
-CLIMBS_PER_CITY = 13
-CURBS_PER_CITY = 8
+CLIMBS_PER_CITY = 8
+CURBS_PER_CITY = 5
 V_MPS = 1.3
 FULL_MPS = 2.5
 TICK_S = 0.05
 
 
 @pytest.fixture(scope="module", params=CITIES, ids=[city.name for city in CITIES])
-def place(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> StreetMap:
-    path = tmp_path_factory.mktemp("ramps") / "city.net.xml"
-    build_city(request.param, path)
-    return read_net(Path(path))
+def place(request: pytest.FixtureRequest) -> StreetMap:
+    return street_map_of(city_net(request.param))
 
 
 def climbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[tuple[str, Polyline]]:

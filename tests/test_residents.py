@@ -339,7 +339,7 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     from scenarios.run import episode
 
     whole = with_crowd(suite("long-horizon"), residents=6)
-    scenario = msgspec.structs.replace(whole.scenarios[0], time_limit_s=12.0)
+    scenario = msgspec.structs.replace(whole.scenarios[0], time_limit_s=10.0)
     names: set[str] = set()
 
     def watch(step: Step, verdict: Verdict) -> None:
