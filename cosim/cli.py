@@ -114,6 +114,7 @@ def run(
     from physics.cameras import renderer_of
     from scenarios.catalog import chosen, with_crowd
     from scenarios.catalog import suite as shipped
+    from scenarios.fits import LOOKING, check_places
     from scenarios.pace import announcement, remembered
     from scenarios.pool import run_all
 
@@ -145,6 +146,8 @@ def run(
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
+    with doing(LOOKING) as tell:
+        check_places(whole, picked, tell)
     on_air = None if live is None else Live(endpoint=checked_endpoint(live, "--live"), run=keys.chunk(path.name))
     outside = None
     if director is not None:
@@ -165,14 +168,13 @@ def run(
         board = Board(picked, done, compared=counterfactual)
         try:
             with board.bars, remembered(held, todo, jobs):
-                tell = board.tell
                 run_all(
                     held,
                     todo,
                     policy,
                     manifest,
                     jobs=jobs,
-                    tell=tell,
+                    tell=board.tell,
                     frames_every_s=frames,
                     camera=drawn_by,
                     live=on_air,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
 from types import UnionType
@@ -43,13 +43,14 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
         return msgspec.json.decode(data, type=kind)
     except _REFUSED as error:
         faults = list(islice(_faults(data, kind, error), MOST_COUNTED))
-        raise SpecError(f"{path}: {_told(faults)}") from error
+        raise SpecError(f"{path}: {in_lines(faults)}") from error
 
 
-def _told(faults: list[str]) -> str:
+def in_lines(faults: Sequence[str]) -> str:
+    """A fault as it is; of several, their number and the first MOST_TOLD of them, a line each."""
     if len(faults) == 1:
         return faults[0]
-    count = f"{len(faults)} faults" + (" or more" if len(faults) == MOST_COUNTED else "")
+    count = f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
     which = f"; the first {MOST_TOLD}" if len(faults) > MOST_TOLD else ""
     return "\n  ".join([f"{count}{which}:", *faults[:MOST_TOLD]])
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import lru_cache, partial
-from pathlib import Path
+from functools import partial
 
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
@@ -19,7 +18,7 @@ from cosim.loop import Parts
 from cosim.ports import CameraSpec, Eyes, Policy
 from cosim.record import NO_RENDERER
 from cosim.roadway import Roadway
-from cosim.scenario import City, Place, Scenario
+from cosim.scenario import Scenario
 from cosim.streetmap import Port, StreetMap, WalkableArea
 from physics.cameras import CameraChoice, camera_of, chosen, renderer_of
 from physics.furniture import Prop, footprints
@@ -27,12 +26,10 @@ from physics.world import BulletWorld
 from scenarios.barriers import fenced
 from scenarios.directing import Direct, directed
 from scenarios.guests import Guests
+from scenarios.places import place
 from scenarios.residents.director import among_residents
-from sumo_nets.atlas import street_map_of
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.entrances import Entrances
-from sumo_nets.mapstore import map_net, read_map
-from sumo_nets.store import city_net
 
 CORRIDOR_M = 40.0
 """The walkable area is judged this far around the route; beyond it everything is out of lane."""
@@ -115,12 +112,3 @@ def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | M
     ground = footprints(props)
     ground = ground[shapely.intersects(area, ground)]
     return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area
-
-
-@lru_cache(maxsize=1)
-def place(where: Place) -> tuple[Path, StreetMap]:
-    """The net of a place and what was read from it; the last one is kept."""
-    if isinstance(where, City):
-        path = city_net(where)
-        return path, street_map_of(path)
-    return map_net(where), read_map(where)

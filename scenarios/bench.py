@@ -82,8 +82,8 @@ class Drive(NamedTuple):
 def scenario_in(size_m: float) -> Scenario:
     """A long-horizon scenario with 50 persons and 20 vehicles in a city of a size."""
     from cosim.walks import WalkGraph
-    from scenarios.assemble import place
     from scenarios.long_horizon import build
+    from scenarios.places import place
 
     city = City(seed=5, size_m=size_m)
     _, street_map = place(city)

@@ -24,9 +24,9 @@ from cosim.referee import STANDING_MPS, Verdict
 from cosim.scenario import City, Scenario
 from cosim.step import Step
 from cosim.walks import WalkGraph
-from scenarios.assemble import place
 from scenarios.crossings import build_all
 from scenarios.crowd_tally import Tally
+from scenarios.places import place
 from scenarios.run import Outcome, episode
 from scenarios.worker import die_with
 from sumo_nets.stoplines import StopLines

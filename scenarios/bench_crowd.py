@@ -32,12 +32,13 @@ from physics.furniture import footprints
 from physics.ground import Ground
 from physics.robots import robot as robot_model
 from physics.tiles import key_at
-from scenarios.assemble import clear_of, place
+from scenarios.assemble import clear_of
 from scenarios.barriers import fenced
 from scenarios.behaviors import react
 from scenarios.crowd_tally import Tally
 from scenarios.group_tally import widest_gaps
 from scenarios.long_horizon import build
+from scenarios.places import place
 from scenarios.residents.director import among_residents
 from sumo_nets.crowd import SumoCrowd
 from sumo_nets.stoplines import StopLines

@@ -48,7 +48,7 @@ def measure(rounds: int, tell: Callable[[str], None]) -> dict[int, list[StreetSt
 def street_step(persons: int) -> StreetStep:
     """Walk a robot down a long-horizon route among so many persons for a simulated minute."""
     import sumo_nets.limits
-    from scenarios.assemble import place
+    from scenarios.places import place
     from sumo_nets.crowd import SumoCrowd
 
     scenario, inside = scenario_in(2000.0), Spent(float)

@@ -22,7 +22,7 @@ from cosim.record import Record
 from cosim.scenario import City, Scenario, Suite, content_hash, write_suite
 from cosim.walks import WalkGraph
 from scenarios import long_horizon, reactive
-from scenarios.assemble import place
+from scenarios.places import place
 from scenarios.run import episode
 from sumo_nets.seeds import shipped_cities
 

@@ -18,9 +18,10 @@ from cosim.scenario import City, CrowdSpec, Scenario
 from cosim.versions import versions
 from cosim.walks import WalkGraph
 from physics.cameras import chosen, renderer_of
-from scenarios.assemble import place, staged
+from scenarios.assemble import staged
 from scenarios.directing import directed
 from scenarios.long_horizon import build
+from scenarios.places import place
 from sumo_nets.store import cache_folder
 
 SMALL = City(seed=1, size_m=500.0)

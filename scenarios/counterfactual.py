@@ -16,7 +16,7 @@ from cosim.referee import Verdict
 from cosim.scenario import Scenario
 from cosim.state import RobotState
 from cosim.step import Step
-from scenarios.assemble import place
+from scenarios.places import place
 from sumo_nets.again import StreetAgain
 from sumo_nets.entrances import Entrances
 

@@ -25,7 +25,7 @@ from cosim.scenario import CrowdSpec, Place
 from cosim.state import RobotState
 from cosim.streetmap import StreetMap
 from cosim.walks import WalkGraph
-from scenarios.assemble import place
+from scenarios.places import place
 from scenarios.worker import die_with
 from sumo_nets.crowd import SumoCrowd
 

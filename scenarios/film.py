@@ -30,8 +30,9 @@ from cosim.state import RobotState, Street
 from cosim.step import Step
 from cosim.telling import Tell, untold
 from physics.cameras import CameraChoice
-from scenarios.assemble import place, staged
+from scenarios.assemble import staged
 from scenarios.look import View, behind, over
+from scenarios.places import place
 from scenarios.replay import Alike, check, recorded
 from scenarios.run import drive
 

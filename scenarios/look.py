@@ -20,7 +20,8 @@ from cosim.state import RobotState, Street
 from cosim.step import Step
 from cosim.telling import Tell, untold
 from physics.cameras import CameraChoice
-from scenarios.assemble import place, staged
+from scenarios.assemble import staged
+from scenarios.places import place
 from scenarios.run import drive
 
 View = Literal["robot", "follow", "above"]

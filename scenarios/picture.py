@@ -10,7 +10,7 @@ from cosim.errors import MachineError, RunError
 from cosim.record import Log, Record
 from cosim.report.above import draw_above
 from cosim.scenario import read_suite
-from scenarios.assemble import place
+from scenarios.places import place
 
 
 def draw_episode(folder: Path, scenario_id: str, output: Path) -> None:

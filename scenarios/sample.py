@@ -11,8 +11,8 @@ from cosim.geometry import Polyline
 from cosim.scenario import CityMap, Scenario, Suite
 from cosim.streetmap import StreetMap, Strip
 from cosim.walks import WalkGraph
-from scenarios.assemble import place
 from scenarios.long_horizon import build
+from scenarios.places import place
 
 PERSON_M2 = 25.0
 """Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""

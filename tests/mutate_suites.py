@@ -1,20 +1,35 @@
 """Suite files as an enemy writes them: a sound one, changed in one to four places, from a seed.
 
-    python -m tests.mutate_suites --run 200
+    python -m tests.mutate_suites --drive 200
 
-drives as many of those that are accepted for two simulated seconds each, in this process, and prints what came of it.
+goes on until so many were accepted and driven for two simulated seconds each, and prints what became of all.
 """
 
 from __future__ import annotations
 
+import argparse
 import copy
 import json
 import math
+import tempfile
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from itertools import count
+from pathlib import Path
 from random import Random
-from typing import Any, Final
+from typing import Any, Final, Literal, NamedTuple
+
+import msgspec
+
+from cosim.errors import SpecError
+from cosim.events import Kind
+from cosim.ports import Manifest, Observation
+from cosim.scenario import City, CrowdSpec, Scenario, Suite, read_suite
+from cosim.state import Command
 
 Tree = dict[str, Any]
+
+DRIVEN_S: Final = 2.0
 
 NUMBERS: Final = (
     math.nan, math.inf, -math.inf, 1e308, -1e308, 9e18, 1e9, -1e9, 1e-320, 0, -1, 2**31, 2**63, -(2**63), 10**30,
@@ -128,3 +143,95 @@ def _bytes_changed(data: bytes, rng: Random) -> bytes:
         lambda: rng.randbytes(200),
     )
     return rng.choice(changes)()
+
+
+class Ahead:
+    """Drives straight ahead without looking."""
+
+    manifest = Manifest("ahead", camera=None)
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(1.2, 0.0)
+
+
+class Fate(NamedTuple):
+    """What became of a file. words: of the refusal, or why the episode crashed."""
+
+    seed: int
+    what: Literal["refused", "does not fit its place", "driven", "crashed", "raw error"]
+    words: str = ""
+
+
+def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
+    """What becomes of each file: if it is accepted, the first scenario that is another than before is driven."""
+    from scenarios.fits import check_places
+
+    sound = msgspec.convert(whole, Suite).scenarios
+    path = folder / "mutated.json"
+    for seed in seeds:
+        path.write_bytes(mutated(whole, seed))
+        try:
+            suite = read_suite(path)
+        except SpecError as error:
+            yield Fate(seed, "refused", str(error))
+            continue
+        try:
+            check_places(suite, suite.scenarios)
+        except SpecError as error:
+            yield Fate(seed, "does not fit its place", str(error))
+            continue
+        yield _driven(next((s for s in suite.scenarios if s not in sound), suite.scenarios[0]), seed)
+
+
+def _driven(scenario: Scenario, seed: int) -> Fate:
+    from scenarios.run import episode
+
+    outcome = episode(msgspec.structs.replace(scenario, time_limit_s=DRIVEN_S), Ahead())
+    record = outcome.record
+    if record.status != "crashed":
+        return Fate(seed, "driven", record.state_hash)
+    raw = record.reason.partition(":")[0].isidentifier()
+    return Fate(seed, "raw error" if raw else "crashed", f"{record.reason}\n{outcome.traceback}")
+
+
+def small_suite(city: City) -> Tree:
+    """The file of a suite in a small city: a long way, and short ones with people who talk, queue, cross, stop it."""
+    from cosim.walks import WalkGraph
+    from scenarios import long_horizon, reactive
+    from scenarios.places import place
+
+    _, street_map = place(city)
+    graph = WalkGraph(street_map)
+    kinds: tuple[Kind, ...] = ("conversing", "ped_crossing", "gesturing")
+    whole = [long_horizon.build(city, street_map, graph, 1, "long")]
+    whole += [reactive.build(kind, city, street_map, graph, 1, kind) for kind in kinds]
+    few = CrowdSpec(persons=6, radius_m=40.0, vehicles=2)
+    scenarios = [msgspec.structs.replace(s, crowd=few) for s in whole]
+    return json.loads(msgspec.json.encode(Suite(name="small", version="1", scenarios=tuple(scenarios))))  # type: ignore[no-any-return]
+
+
+def main() -> None:
+    """Drive as many accepted ones as asked for. Exit code 1 if any crashed."""
+    parser = argparse.ArgumentParser(prog="python -m tests.mutate_suites")
+    parser.add_argument("--drive", type=int, default=200, help="how many accepted ones are driven")
+    parser.add_argument("--from-seed", type=int, default=0)
+    asked = parser.parse_args()
+    seen: Counter[str] = Counter()
+    with tempfile.TemporaryDirectory() as folder:
+        for fate in fates(small_suite(City(seed=1, size_m=500.0)), Path(folder), count(asked.from_seed)):
+            seen[fate.what] += 1
+            if fate.what in ("crashed", "raw error"):
+                print(f"seed {fate.seed}: {fate.what}: {fate.words}", flush=True)
+            if sum(seen[what] for what in ("driven", "crashed", "raw error")) >= asked.drive:
+                break
+            if sum(seen.values()) % 100 == 0:
+                print(dict(seen), flush=True)
+    print(dict(seen))
+    raise SystemExit(1 if seen["raw error"] + seen["crashed"] else 0)
+
+
+if __name__ == "__main__":
+    main()

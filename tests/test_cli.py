@@ -87,8 +87,8 @@ class Unfinished: pass
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder: a suite of three short scenarios, one of six, and a module with policies."""
-    from scenarios.assemble import place
     from scenarios.long_horizon import build
+    from scenarios.places import place
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
@@ -382,14 +382,26 @@ def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.Monke
     assert ended.value.code == 130
 
 
-def test_a_suite_of_another_city_is_refused(desk: Path, cosim: Cosim) -> None:
-    """A scenario made on another street net is a crash with the remedy, not a wrong result."""
-    suite = json.loads((desk / "tiny.json").read_text())
-    suite["scenarios"] = suite["scenarios"][:1]
-    suite["scenarios"][0]["place"]["net_hash"] = "0" * 16
-    (desk / "other.json").write_text(json.dumps(suite))
-    said = cosim("run", "other.json", "--policy", "stop", "--out", "other", cwd=desk)
-    assert said.returncode == 1 and "the net's hash is" in said.stdout
+def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim) -> None:
+    """A start off the sidewalk, another street net, a robot and a map that nobody knows: told together, before anything
+    runs, and no folder is left."""
+    suite = json.loads((desk / "six.json").read_text())
+    off, other, robot, unknown, *_ = suite["scenarios"]
+    off["start"][:2] = off["route"][0] = [-50.0, -50.0]
+    other["place"]["net_hash"] = "0" * 16
+    robot["robot"] = "tank"
+    unknown["place"] = {"kind": "map", "map": "atlantis"}
+    (desk / "odd.json").write_text(json.dumps(suite))
+    said = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=desk)
+    assert said.returncode == 2 and not (desk / "odd").exists()
+    head, *faults = said.stderr[said.stderr.index("error: ") :].splitlines()
+    assert head == "error: suite 'six': 5 faults:" and len(faults) == 5
+    for words in (
+        "scenario 't-0': start is off the walkable area at (-50.00, -50.00)", "scenario 't-0': crossing ",
+        "scenario 't-1': ", "the net's hash is ", "scenario 't-2': unknown robot 'tank'. Valid choices: courier",
+        "scenario 't-3': unknown map 'atlantis'",
+    ):  # fmt: skip
+        assert sum(words in fault for fault in faults) == 1, (words, faults)
 
 
 def test_the_doctor_finds_every_engine_well(desk: Path, fresh_cosim: Cosim) -> None:

@@ -19,9 +19,9 @@ from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from cosim.state import RobotState, Street
 from cosim.streetmap import Port
 from cosim.walks import WalkGraph
-from scenarios.assemble import place
 from scenarios.crossings import build_all
 from scenarios.messages import Compares, Done, Message, Progress
+from scenarios.places import place
 from scenarios.pool import run_all
 from scenarios.run import episode
 from sumo_nets.again import StreetAgain

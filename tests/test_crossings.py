@@ -21,8 +21,8 @@ from cosim.scenario import City, CrowdSpec
 from cosim.state import Command, RobotState
 from cosim.step import Step
 from cosim.walks import WalkGraph
-from scenarios.assemble import place
 from scenarios.crossings import AFTER_M, BEFORE_M, build_all
+from scenarios.places import place
 from scenarios.run import episode
 from sumo_nets.crowd import SumoCrowd
 from tests.conftest import Cosim

@@ -102,7 +102,7 @@ class Blind:
 
 def frontal(scenario_id: str) -> Scenario:
     """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the robot."""
-    from scenarios.assemble import place
+    from scenarios.places import place
     from scenarios.reactive import build
 
     city = City(seed=1, size_m=500.0)

@@ -77,7 +77,7 @@ def test_a_late_trigger_is_counted() -> None:
 def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path, cosim: Cosim) -> None:
     """--event takes those alone, an unknown one is answered with those there are, --events shows what was measured."""
     from cosim.walks import WalkGraph
-    from scenarios.assemble import place
+    from scenarios.places import place
     from scenarios.reactive import build
 
     city = City(seed=1, size_m=500.0)

@@ -30,8 +30,8 @@ pytestmark = pytest.mark.engine
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
-    from scenarios.assemble import place
     from scenarios.long_horizon import build
+    from scenarios.places import place
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)

@@ -19,7 +19,7 @@ from physics.camera import BulletCamera
 from physics.gl import context
 from physics.gl.camera import GlCamera
 from physics.world import BulletWorld
-from scenarios.assemble import place
+from scenarios.places import place
 
 pytestmark = [
     pytest.mark.engine,

@@ -275,8 +275,8 @@ def once(what: Callable[[], bool]) -> None:
 @contextmanager
 def on_air(folder: Path) -> Iterator[OnAir]:
     """`cosim run --live` of an episode that lasts until it is told to end."""
-    from scenarios.assemble import place
     from scenarios.long_horizon import build
+    from scenarios.places import place
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)

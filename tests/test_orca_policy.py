@@ -129,7 +129,7 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
 def test_the_reference_solver_solves_every_event(kind: Kind, seed: int) -> None:
     """One scenario of each event, with real engines: triggered, seen, its rule kept, its end reached."""
     from cosim.walks import WalkGraph
-    from scenarios.assemble import place
+    from scenarios.places import place
     from scenarios.reactive import build
     from scenarios.run import episode
 
@@ -148,7 +148,7 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
     from cosim.ports import Manifest
     from cosim.state import Command
     from cosim.walks import WalkGraph
-    from scenarios.assemble import place
+    from scenarios.places import place
     from scenarios.reactive import build
     from scenarios.run import episode
 

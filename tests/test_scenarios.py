@@ -153,7 +153,7 @@ def test_free_space_ends_at_furniture() -> None:
 @pytest.mark.parametrize("scenario", LONG, ids=lambda s: s.id)
 def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
     """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
-    from scenarios.assemble import place
+    from scenarios.places import place
 
     _, street_map = place(scenario.place)
     route = scenario.route_line
