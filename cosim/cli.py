@@ -21,6 +21,7 @@ from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_on
 from cosim.cli_eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli_live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli_map import map_app
+from cosim.cli_output import told_streams
 from cosim.cli_progress import doing
 from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError
 
@@ -321,11 +322,12 @@ app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 def main() -> None:
     """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is left."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        app()
-    except CosimError as error:
-        err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-        raise SystemExit(error.exit_code) from None
+    with told_streams():
+        try:
+            app()
+        except CosimError as error:
+            err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
+            raise SystemExit(error.exit_code) from None
 
 
 if __name__ == "__main__":

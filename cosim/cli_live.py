@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import sys
 import time
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from pathlib import Path
+from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -68,9 +69,13 @@ def listen(
     with session:
         if topic == "events":
             print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
-        session.listen(f"{below}/{topic}", lambda _, payload: print(payload.decode(), flush=True))
+        heard: SimpleQueue[bytes] = SimpleQueue()
+        session.listen(f"{below}/{topic}", lambda _, payload: heard.put(payload))
+        ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)
         try:
-            time.sleep(seconds if seconds is not None else 1e9)
+            while (left_s := ends_at - time.monotonic()) > 0.0:
+                with suppress(Empty):
+                    print(heard.get(timeout=left_s).decode(), flush=True)
         except KeyboardInterrupt:
             raise typer.Exit(INTERRUPTED) from None
 

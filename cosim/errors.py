@@ -24,6 +24,8 @@ SOME_CRASHED = 1
 WRONG_USE = 2
 BROKEN_MACHINE = 3
 INTERRUPTED = 130
+UNREAD = 141
+"""Nobody reads standard output any more; shells give this code to a program that a closed pipe has ended."""
 
 MOST_LISTED = 30
 """Of more valid choices than these, five are listed: those most like what was asked for, else the first."""

@@ -124,6 +124,8 @@ class RouteCrossing(Ranged, frozen=True, kw_only=True):
 
 
 DEFAULT_PERSONS = 50
+MOST_PERSONS = 1000
+"""More take SUMO longer than a run waits for an episode."""
 MOST_PER_1000_M2 = 150.0
 """Denser crowds have no room to enter 1.5 m apart."""
 
@@ -138,7 +140,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     slower than others. A child walks in a group with an adult, at the child's pace.
     """
 
-    persons: Annotated[int, Within(0, 1000)] = DEFAULT_PERSONS
+    persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
     radius_m: Annotated[float, Within(20, 500)] = 80.0
     vehicles: Annotated[int, Within(0, 200)] = 20
     density: Annotated[

@@ -7,10 +7,11 @@ from typing import Final
 
 import numpy as np
 import shapely
+from msgspec import UnsetType
 from shapely.geometry import LineString, Point
 
 from cosim.errors import MapError, SpecError, UsageError
-from cosim.scenario import Place, RouteCrossing, Scenario, Suite
+from cosim.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite
 from cosim.specfile import in_lines
 from cosim.streetmap import StreetMap, WalkableArea
 from cosim.telling import Tell, untold
@@ -19,6 +20,7 @@ from physics.robots import ROBOTS
 from physics.robots import robot as robot_model
 from scenarios.barriers import outline
 from scenarios.places import place
+from sumo_nets.room import Room
 
 LOOKING: Final = "looking where the episodes take place"
 AROUND_M: Final = 3.0
@@ -64,7 +66,12 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
         )
         return
     for scenario in scenarios:
-        told = (*_off(scenario, area), *_odd_crossings(scenario, street_map), *_odd_barriers(scenario, street_map))
+        told = (
+            *_off(scenario, area),
+            *_odd_crossings(scenario, street_map),
+            *_odd_barriers(scenario, street_map),
+            *_crowded(scenario, street_map),
+        )
         yield from (f"scenario '{scenario.id}': {fault}" for fault in told)
 
 
@@ -111,6 +118,18 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
             yield f"barriers[{number}] stands {far_m:.0f} m from strip '{barrier.strip}', which it should close"
         elif fence.distance(route) < half_width_m:
             yield f"barriers[{number}] on strip '{barrier.strip}' stands across the route"
+
+
+def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
+    """Crowds that by their density are more people than one may ask for by number."""
+    crowd = scenario.crowd
+    if not isinstance(crowd.density, UnsetType):
+        room_m2 = Room(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
+        if (persons := round(crowd.density * room_m2 / 1000.0)) > MOST_PERSONS:
+            yield (
+                f"crowd density {crowd.density:g} within {crowd.radius_m:g} m of the start makes {persons} persons, "
+                f"and at most {MOST_PERSONS} can be had: lower density or radius_m"
+            )
 
 
 def _not_here(scenarios: Iterable[Scenario]) -> Iterator[str]:

@@ -34,7 +34,9 @@ DRIVEN_S: Final = 2.0
 NUMBERS: Final = (
     math.nan, math.inf, -math.inf, 1e308, -1e308, 9e18, 1e9, -1e9, 1e-320, 0, -1, 2**31, 2**63, -(2**63), 10**30,
     10**400, -0.0, 0.5, 3.7, 41,
+    1e-9, 0.01, 0.1, 1, 2, 3, 5, 10, 20, 24, 50, 60, 90, 150, 200, 300, 366, 500, 1000, 3600, 50_000, 2**32 - 1,
 )  # fmt: skip
+"""What no field may be, and the ends of the ranges of those that there are."""
 WORDS: Final = (
     "", "../../x", "/etc/passwd", "a\nb", "\x1b[31mred", "\x00", "[/x]", "[red]", "\u202e", "\ud800", "e" * 5000,
     "-x", ".x",

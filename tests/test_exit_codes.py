@@ -86,5 +86,12 @@ def test_what_a_command_raises_is_its_exit_code(
 def test_the_readme_tells_the_exit_codes() -> None:
     """The table of the README names every code of the module."""
     readme = (Path(__file__).parents[1] / "README.md").read_text()
-    for code in (errors.ALL_SCORED, errors.SOME_CRASHED, errors.WRONG_USE, errors.BROKEN_MACHINE, errors.INTERRUPTED):
+    for code in (
+        errors.ALL_SCORED,
+        errors.SOME_CRASHED,
+        errors.WRONG_USE,
+        errors.BROKEN_MACHINE,
+        errors.INTERRUPTED,
+        errors.UNREAD,
+    ):
         assert f"\n| {code} |" in readme

@@ -12,7 +12,7 @@ from shapely.geometry import LineString, box
 
 from cosim.errors import SpecError
 from cosim.events import Event
-from cosim.scenario import Barrier, City, Light, RouteCrossing, Scenario, Suite
+from cosim.scenario import Barrier, City, CrowdSpec, Light, RouteCrossing, Scenario, Suite
 from cosim.streetmap import Corner, Port, StreetMap, Strip
 from scenarios import fits
 from scenarios.fits import check_places, misfits
@@ -101,6 +101,16 @@ def test_what_fits_is_not_spoken_of() -> None:
 def test_what_does_not_fit_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:
     """Field, number or id, and where it is."""
     assert list(misfits([from_west_to_east(**changes)], crossroads())) == [f"scenario 's': {told}"]
+
+
+def test_a_density_makes_no_more_people_than_may_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How many it makes is known where the map is: 400 m2 hold 60 people at 150 per 1000 m2."""
+    monkeypatch.setattr(fits, "MOST_PERSONS", 59)
+    dense = from_west_to_east(crowd=CrowdSpec(density=150.0))
+    assert list(misfits([dense], crossroads())) == [
+        "scenario 's': crowd density 150 within 80 m of the start makes 60 persons, and at most 59 can be had: "
+        "lower density or radius_m"
+    ]
 
 
 def test_a_scenario_far_from_everything_is_not_on_the_map() -> None:

@@ -314,11 +314,15 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 
         once(lambda: in_the_log() == ["anna"])
         words = [sys.executable, "-m", "cosim", "listen", "robot", *there]
-        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
-            assert listener.stdout is not None
-            ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
-            listener.terminate()
-        assert listener.returncode == 130 and all("x_m" in tick for tick in ticks)
+        for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
+            with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
+                assert listener.stdout is not None
+                ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
+                if code == 130:
+                    listener.terminate()
+                    listener.wait()
+                listener.stdout.close()
+            assert listener.returncode == code and all("x_m" in tick for tick in ticks), ends
         record = air.record()
     assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import re
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ import msgspec
 import pytest
 
 from cosim.errors import SpecError
-from cosim.scenario import Suite, read_suite
+from cosim.scenario import City, Suite, read_suite
 from scenarios.catalog import SUITES, suite
-from tests.mutate_suites import mutated
+from tests.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
 """How a refusal says where in the file something is wrong."""
@@ -54,6 +55,21 @@ def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) 
             faults = lines[1:] if len(lines) > 1 else lines
             assert all(PLACE.search(line) for line in faults), (seed, told)
     assert 100 < accepted < 600
+
+
+@pytest.mark.engine
+def test_mutated_suites_that_are_accepted_can_be_driven(tmp_path: Path) -> None:
+    """Of those that the reader and the map let through eight are driven for two seconds: none crashes. (`python -m
+    tests.mutate_suites` drives 200.)"""
+    driven = []
+    for fate in fates(small_suite(City(seed=1, size_m=500.0)), tmp_path, count(0)):
+        if fate.what == "does not fit its place":
+            assert all(line.isprintable() and len(line) <= 500 for line in fate.words.splitlines()), fate
+        elif fate.what != "refused":
+            driven.append(fate)
+        if len(driven) == 8:
+            break
+    assert [fate.what for fate in driven] == ["driven"] * 8, driven
 
 
 OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
