@@ -8,6 +8,7 @@ from pathlib import Path
 import pandas as pd
 from rich import box
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Column, Table
 
 from cosim.clock import Clock
@@ -82,7 +83,7 @@ def print_scenarios(out: Console, suite: Suite) -> None:
     for s in suite.scenarios:
         events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
         numbers = (f"{s.route_line.length_m:.0f}", str(len(s.crossings)), events, str(len(s.barriers)))
-        shown.add_row(s.id, s.place.name, *numbers, f"{s.time_limit_s:.0f}")
+        shown.add_row(s.id, escape(s.place.name), *numbers, f"{s.time_limit_s:.0f}")
     out.print(shown)
 
 

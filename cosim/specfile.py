@@ -57,6 +57,9 @@ def in_lines(faults: Sequence[str]) -> str:
 
 def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
     """Every fault of a file that was refused with `error`."""
+    if _of_the_whole(error):
+        yield f"{error} - at `$`"
+        return
     try:
         # It takes NaN and numbers without end, which the other reader refuses without naming their field.
         tree = json.loads(data)
@@ -114,14 +117,18 @@ def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
         msgspec.convert(tree, kind)
         return
     except _REFUSED as error:
-        message, own = str(error), isinstance(error.__cause__, SpecError)
-    own = own and not _PLACE.search(message)
+        message, whole = str(error), _of_the_whole(error)
     found = False
-    for fault in () if own else _faults_below(tree, _bare(kind, tree), place):
+    for fault in () if whole else _faults_below(tree, _bare(kind, tree), place):
         found = True
         yield fault
     if not found:
         yield f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at `{place}`{_choices(kind, tree)}"
+
+
+def _of_the_whole(error: Exception) -> bool:
+    """Whether a value was refused for a contradiction of its own: then its parts are sound."""
+    return isinstance(error.__cause__, SpecError) and not _PLACE.search(str(error))
 
 
 def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:

@@ -6,12 +6,14 @@ import io
 import re
 from pathlib import Path
 
+import msgspec
 import pandas as pd
 import pytest
 from rich.console import Console
 
 from cosim.cli_tables import BY_KIND, COUNTS, LETTERS, SHOWN, print_by_kind, print_scenarios, print_table
 from cosim.errors import unknown
+from cosim.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, suite
 
 
@@ -28,6 +30,15 @@ def test_the_scenarios_of_a_suite_fit_80_columns(name: str) -> None:
     assert "…" not in said.getvalue()
     for scenario in suite(name).scenarios:
         assert f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
+
+
+def test_a_name_with_brackets_is_shown_as_it_is() -> None:
+    """What would end or begin a colour is part of the name of a map."""
+    (scenario,) = suite("long-horizon").scenarios[:1]
+    odd = msgspec.structs.replace(scenario, place=CityMap(map="[/x][red]"))
+    out, said = terminal()
+    print_scenarios(out, Suite(name="s", version="1", scenarios=(odd,)))
+    assert " map-[/x][red] " in said.getvalue()
 
 
 def test_a_bad_run_fits_80_columns() -> None:
