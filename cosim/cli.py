@@ -98,6 +98,12 @@ def run(
     director_wait: Annotated[
         float, typer.Option(min=0.1, max=LONGEST_WAIT_S, help="Seconds to wait for it; then the episode has crashed.")
     ] = 60.0,
+    answer_timeout: Annotated[
+        float, typer.Option(min=0.1, help="Seconds a policy may take to answer; then its episode has crashed.")
+    ] = 60.0,
+    start_timeout: Annotated[
+        float, typer.Option(min=0.1, help="The same for loading it, for its reset, and for the first answer after it.")
+    ] = 300.0,
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
@@ -113,6 +119,7 @@ def run(
     from cosim.runfolder import RunFolder, RunSpec
     from cosim.versions import versions
     from physics.cameras import renderer_of
+    from scenarios.asked import Patience
     from scenarios.catalog import chosen, with_crowd
     from scenarios.catalog import suite as shipped
     from scenarios.fits import LOOKING, check_places
@@ -129,7 +136,8 @@ def run(
         whole = shipped(suite)
     whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
     picked = chosen(whole, scenario or (), episodes, event or ())
-    manifest = load_policy(policy).manifest
+    loaded = load_policy(policy)
+    manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     spec = RunSpec(
         suite=whole.name,
@@ -138,6 +146,7 @@ def run(
         policy=policy,
         policy_name=manifest.name,
         policy_version=manifest.version,
+        policy_source=loaded.source_hash,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
         renderer=renderer_of(drawn_by) if manifest.camera is not None else NO_RENDERER,
@@ -159,6 +168,8 @@ def run(
             stack.enter_context(Session.hub(on_air.endpoint))
         held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
         stack.enter_context(held)
+        for note in held.notes:
+            err.print(note, soft_wrap=True, markup=False, highlight=False)
         done = held.finished()
         todo = [s for s in picked if s.id not in done]
         if done:
@@ -173,13 +184,14 @@ def run(
                     held,
                     todo,
                     policy,
-                    manifest,
+                    loaded,
                     jobs=jobs,
                     tell=board.tell,
                     frames_every_s=frames,
                     camera=drawn_by,
                     live=on_air,
                     outside=outside,
+                    patience=Patience(answer_timeout, start_timeout),
                 )
         except KeyboardInterrupt:
             finished = len(held.finished())

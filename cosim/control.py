@@ -14,6 +14,9 @@ from cosim.errors import PolicyError
 from cosim.state import Command
 
 EPS_M = 1e-8
+REAL_KINDS = "iuf"
+"""The kinds of numpy that are real numbers: integers, unsigned, floating."""
+MOST_SHOWN = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,32 +43,60 @@ def clipped(command: Command, limits: Limits) -> Command:
     )
 
 
-def command_of(answer: object, *, waypoint_dt_s: float, limits: Limits, who: str) -> Command:
+def command_of(answer: object, *, waypoint_dt_s: float, limits: Limits) -> Command:
     """The clipped command in a policy's answer: a Command, or waypoints (N, 2) of which the first is followed.
 
-    Raises PolicyError, naming the policy and what it answered, for NaN, infinities and anything of another shape.
+    Raises PolicyError, saying what was answered, for NaN, infinities, and anything that is not real numbers of that
+    shape: truth values, texts and complex numbers are none.
     """
     if isinstance(answer, Command):
-        v_mps, w_radps = answer.v_mps, answer.w_radps
-        if not (_is_number(v_mps) and _is_number(w_radps)):
-            kinds = f"{type(v_mps).__name__}, {type(w_radps).__name__}"
-            raise PolicyError(f"policy '{who}' answered a Command of {kinds}: both speeds must be finite numbers")
-        return clipped(Command(float(v_mps), float(w_radps)), limits)
+        speeds = (answer.v_mps, answer.w_radps)
+        numbers = [_number(speed) for speed in speeds]
+        if not all(map(math.isfinite, numbers)):
+            shown = ", ".join(f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True))
+            raise PolicyError(f"answered Command({shown}): both must be finite numbers")
+        return clipped(Command(*numbers), limits)
+    dx_m, dy_m = _first_waypoint(answer)
+    return clipped(command_from_waypoint(dx_m, dy_m, waypoint_dt_s), limits)
+
+
+def _first_waypoint(answer: object) -> tuple[float, float]:
+    """The first of waypoints (N, 2), all of which must be finite."""
     try:
-        waypoints = np.asarray(answer, dtype=float)
-    except (TypeError, ValueError) as error:
-        raise PolicyError(
-            f"policy '{who}' answered a {type(answer).__name__}: neither a Command nor waypoints"
-        ) from error
-    if waypoints.ndim != 2 or waypoints.shape[0] < 1 or waypoints.shape[1] != 2:
-        raise PolicyError(
-            f"policy '{who}' answered an array of shape {waypoints.shape}: waypoints have shape (N, 2), N >= 1"
-        )
+        array = np.asarray(answer)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise PolicyError(f"answered {_shown(answer)}: neither a Command nor waypoints") from error
+    if array.ndim == 0:
+        raise PolicyError(f"answered {_shown(answer)}: neither a Command nor waypoints")
+    if array.dtype.kind not in REAL_KINDS:
+        raise PolicyError(f"answered an array of {array.dtype.name}: waypoints are real numbers")
+    if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] != 2:
+        raise PolicyError(f"answered an array of shape {array.shape}: waypoints have shape (N, 2), N >= 1")
+    with np.errstate(over="ignore"):
+        waypoints = array.astype(float)
     if not np.isfinite(waypoints).all():
         first = waypoints[~np.isfinite(waypoints).all(axis=1)][0].tolist()
-        raise PolicyError(f"policy '{who}' answered waypoints with NaN or infinity: {first}")
-    return clipped(command_from_waypoint(float(waypoints[0, 0]), float(waypoints[0, 1]), waypoint_dt_s), limits)
+        raise PolicyError(f"answered waypoints with NaN or infinity: {first}")
+    return float(waypoints[0, 0]), float(waypoints[0, 1])
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float | np.floating | np.integer) and math.isfinite(value)
+def _number(value: object) -> float:
+    """A real number as float, read once; NaN for anything else, and for what is beyond any float."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.floating | np.integer):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _shown(value: object) -> str:
+    """An answer as it is told: its repr if that is short and can be had, else its kind."""
+    if isinstance(value, int) and value.bit_length() > MOST_SHOWN:
+        return f"an integer of {value.bit_length()} bits"
+    try:
+        text = repr(value)
+    except Exception:  # noqa: BLE001  a repr may do anything
+        return f"a {type(value).__name__}"
+    tells = len(text) <= MOST_SHOWN and text.isprintable() and " at 0x" not in text  # an address is another every time
+    return text if tells else f"a {type(value).__name__}"

@@ -21,13 +21,12 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.bystanders import bystanders
 from cosim.clock import Clock
-from cosim.control import Limits, command_of
-from cosim.errors import PolicyError
+from cosim.driver import Driver
 from cosim.events import EventQuery, EventState
 from cosim.geometry import Polyline, Pose
-from cosim.ports import Camera, Crowd, Director, Observation, Policy, Privileged, World
+from cosim.ports import Camera, Crowd, Director, Observation, Privileged, World
 from cosim.scenario import Scenario
-from cosim.state import STILL, Command, Frame, People, RobotState
+from cosim.state import STILL, Frame, People, RobotState
 from cosim.step import Reset, Step
 
 ROUTE_WINDOW_M = 10.0
@@ -41,9 +40,8 @@ class Parts:
     world: World
     crowd: Crowd
     director: Director
-    policy: Policy
+    driver: Driver
     camera: Camera | None
-    limits: Limits
     free: Polygon | MultiPolygon
 
 
@@ -54,7 +52,7 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
     robot, street = parts.world.place(scenario.start_pose), parts.crowd.street
     command, route_s_m = STILL, 0.0
     states: tuple[EventState, ...] = ()
-    parts.policy.reset(scenario.id, scenario.seed)
+    parts.driver.reset(scenario.id, scenario.seed)
 
     for tick in itertools.count():
         frame = None
@@ -63,7 +61,7 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
             known = Privileged(
                 robot, route, route_s_m, street.people, street.vehicles, street.signals, crossings, parts.free
             )
-            command = ask(parts.policy, observe(tick, clock, robot, frame, known), parts.limits)
+            command = parts.driver.act(observe(tick, clock, robot, frame, known))
         asked = query(scenario, clock, tick, robot, street.people, route_s_m, parts.world.footprint_m, states)
         reply = parts.director.react(asked)
         street_after = parts.crowd.step(robot, reply)
@@ -78,23 +76,9 @@ def steps(scenario: Scenario, clock: Clock, parts: Parts) -> Generator[Step, Res
 
 
 def observe(tick: int, clock: Clock, robot: RobotState, frame: Frame | None, known: Privileged) -> Observation:
-    """What the policy is given; `known` is taken away by `ask` from a policy that does not declare it."""
+    """What is to be known; the driver gives the policy copies, and `known` only to one that declares it."""
     rgb = frame.rgb if frame is not None else None
     return Observation(tick, clock.time_s(tick), rgb, robot.v_mps, robot.w_radps, known)
-
-
-def ask(policy: Policy, observation: Observation, limits: Limits) -> Command:
-    """The policy's command. Raises PolicyError for whatever goes wrong inside the policy."""
-    manifest = policy.manifest
-    if not manifest.privileged:
-        observation = Observation(
-            observation.tick, observation.time_s, observation.rgb, observation.v_mps, observation.w_radps
-        )
-    try:
-        answer = policy.act(observation)
-    except Exception as error:
-        raise PolicyError(f"policy '{manifest.name}' raised {type(error).__name__}: {error}") from error
-    return command_of(answer, waypoint_dt_s=manifest.waypoint_dt_s, limits=limits, who=manifest.name)
 
 
 def query(

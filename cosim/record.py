@@ -118,6 +118,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
+    policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
     """
@@ -129,6 +130,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     seed: int
     policy: str
     policy_version: str
+    policy_source: str = ""
     goal_protocol: str
     renderer: str
     versions: dict[str, str]
@@ -165,7 +167,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return record
 
 
-def begun(scenario: Scenario, manifest: Manifest, suite_hash: str) -> Record:
+def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "") -> Record:
     """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
     return Record(
         scenario=scenario.id,
@@ -175,6 +177,7 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str) -> Record:
         seed=scenario.seed,
         policy=manifest.name,
         policy_version=manifest.version,
+        policy_source=policy_source,
         goal_protocol="route" if manifest.privileged else "none",
         renderer=NO_RENDERER,
         versions=versions(),

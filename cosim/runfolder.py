@@ -29,13 +29,24 @@ from cosim.record import Record
 from cosim.results import row_of, table_of
 from cosim.scenario import Suite, write_suite
 
-UNFINISHED = {"episodes", "logs", "scenarios.json", "run.json.part"}
+DATABASE = "results.sqlite"
+REMEDY = "give the command of the run again with --resume, which makes it anew from the records on disk"
+DAMAGE = {
+    sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_MISMATCH, sqlite3.SQLITE_SCHEMA,
+}  # fmt: skip
+UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
+SAME = (
+    "suite", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios", "versions",
+    "renderer", "counterfactual",
+)  # fmt: skip
+"""What makes two runs the same."""
 
 
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
-    counterfactual: whether each episode is compared with its street without the robot."""
+    counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
+    that the policy is written in (`cosim.policies.load.source_hash`)."""
 
     suite: str
     suite_version: str
@@ -43,6 +54,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy: str
     policy_name: str
     policy_version: str
+    policy_source: str = ""
     scenarios: tuple[str, ...]
     versions: dict[str, str]
     renderer: str = "unknown"
@@ -51,49 +63,35 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class RunFolder:
-    """A run folder held by this process. Use as a context manager: it is locked meanwhile."""
+    """A run folder held by this process. Use as a context manager: it is locked meanwhile, before anything is written.
 
-    def __init__(self, path: Path, spec: RunSpec) -> None:
-        self.path = path
+    path: absolute, so that it stays what it is wherever the process goes. notes: what was mended as it was opened, in
+    words.
+    """
+
+    def __init__(self, path: Path, spec: RunSpec, suite: Suite | None = None) -> None:
+        self.path = path.absolute()
         self.spec = spec
+        self.notes: list[str] = []
+        self._suite = suite
         self._lock = -1
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
-        """A new run folder. Raises RunError when one is there already or the place cannot be written."""
-        if (path / "run.json").exists():
-            raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
-        if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
-            raise RunError(f"{path} exists and is no run folder. Choose another --out.")
-        try:
-            for folder in (path, path / "episodes", path / "logs"):
-                folder.mkdir(parents=True, exist_ok=True)
-            wanted = set(spec.scenarios)
-            chosen = msgspec.structs.replace(suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted))
-            write_suite(chosen, path / "scenarios.json")
-            temporary = path / "run.json.part"
-            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(spec), indent=1) + b"\n")
-            temporary.replace(path / "run.json")
-        except OSError as error:
-            raise unwritable(path, error) from error
-        return cls(path, spec)
+        """A new run folder. Raises RunError when one is there already, MachineError where nothing can be written."""
+        _refuse_used(path)
+        return cls(path, spec, suite)
 
     @classmethod
     def resume(cls, path: Path, spec: RunSpec) -> RunFolder:
         """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run."""
         found = read_spec(path)
-        same = (
-            "suite",
-            "suite_version",
-            "suite_hash",
-            "policy",
-            "policy_version",
-            "scenarios",
-            "versions",
-            "renderer",
-            "counterfactual",
-        )
-        for field in same:
+        if found.policy == spec.policy and found.policy_source != spec.policy_source:
+            raise RunError(
+                f"{path} is of another run: the source of policy '{spec.policy}' was edited since it began. Resume "
+                "with the source as it was, or choose another --out."
+            )
+        for field in SAME:
             mine, theirs = getattr(spec, field), getattr(found, field)
             if mine != theirs:
                 if isinstance(mine, dict) and isinstance(theirs, dict):
@@ -106,22 +104,19 @@ class RunFolder:
         return cls(path, found)
 
     def __enter__(self) -> Self:
-        self._lock = os.open(self.path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            holder = os.pread(self._lock, 32, 0).decode().strip() or "?"
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.path)
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+        try:
+            if self._suite is not None:
+                _refuse_used(self.path)
+                self._begin(self._suite)
+            self._open_database()
+        except BaseException:
             os.close(self._lock)
-            raise RunError(
-                f"{self.path} is in use by process {holder}: another cosim run is writing to it. "
-                "Wait for it to end, or choose another --out."
-            ) from None
-        os.ftruncate(self._lock, 0)
-        os.pwrite(self._lock, str(os.getpid()).encode(), 0)
-        with closing(self._database()) as database, database:
-            database.execute("create table if not exists episodes (scenario text primary key, row text, record text)")
-        for scenario_id in sorted(set(self.spec.scenarios) - self.finished()):
-            self.adopt(scenario_id)
+            raise
         return self
 
     def __exit__(
@@ -134,18 +129,45 @@ class RunFolder:
 
     def finished(self) -> set[str]:
         """Ids of the scenarios that have a row."""
-        with closing(self._database()) as database:
-            return {scenario for (scenario,) in database.execute("select scenario from episodes")}
+        try:
+            with closing(_connect(self.path)) as database:
+                return {scenario for (scenario,) in database.execute("select scenario from episodes")}
+        except sqlite3.Error as error:
+            raise _trouble(self.path, error) from error
 
     def add(self, record: Record) -> None:
         """Append a finished episode. A second one of the same scenario is not taken."""
         row = json.dumps(row_of(record), sort_keys=True)
         text = msgspec.json.encode(record).decode()
         try:
-            with closing(self._database()) as database, database:
+            with closing(_connect(self.path)) as database, database:
                 database.execute("insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text))
         except sqlite3.Error as error:
-            raise MachineError(f"{self.path / 'results.sqlite'}: {error}. Finished episodes are safe.") from error
+            raise _trouble(self.path, error) from error
+
+    def adopt(self, scenario_id: str) -> bool:
+        """Take in the record that a worker wrote for a scenario; False when there is none, or a damaged one."""
+        path = self.episode_folder(scenario_id) / "record.json"
+        if not path.exists():
+            return False
+        try:
+            record = Record.load(path)
+        except RunError as error:
+            self.notes.append(f"{error}. This episode is run again.")
+            return False
+        if record.scenario != scenario_id:
+            self.notes.append(f"{path} is of scenario '{record.scenario}'. This episode is run again.")
+            return False
+        self.add(record)
+        return True
+
+    def forget(self, scenario_id: str) -> None:
+        """Remove what an earlier attempt at a scenario has left."""
+        path = self.episode_folder(scenario_id) / "record.json"
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(path, error) from error
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
@@ -155,20 +177,44 @@ class RunFolder:
             table.to_csv(temporary, index=False)
             temporary.replace(self.path / "results.csv")
         except OSError as error:
-            raise unwritable(
-                self.path / "results.csv", error, "all episodes are kept; make room and add --resume"
-            ) from error
+            remedy = "all episodes are kept; make room and add --resume"
+            raise unwritable(self.path / "results.csv", error, remedy) from error
         return table
 
-    def adopt(self, scenario_id: str) -> bool:
-        """Take in the record that a worker wrote for a scenario; False when there is none."""
-        path = self.episode_folder(scenario_id) / "record.json"
-        if path.exists():
-            self.add(Record.load(path))
-        return path.exists()
+    def _begin(self, suite: Suite) -> None:
+        """Write what is run; run.json last, because a folder with it can be resumed."""
+        try:
+            for folder in (self.path / "episodes", self.path / "logs"):
+                folder.mkdir(exist_ok=True)
+            wanted = set(self.spec.scenarios)
+            chosen = msgspec.structs.replace(suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted))
+            write_suite(chosen, self.path / "scenarios.json")
+            temporary = self.path / "run.json.part"
+            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.spec), indent=1) + b"\n")
+            temporary.replace(self.path / "run.json")
+        except OSError as error:
+            raise unwritable(self.path, error) from error
 
-    def _database(self) -> sqlite3.Connection:
-        return _connect(self.path)
+    def _open_database(self) -> None:
+        """Make sure of a sound database with a row for every record on disk; a damaged one is made anew from these."""
+        database, mended = self.path / DATABASE, ""
+        try:
+            _check(self.path)
+        except (sqlite3.Error, msgspec.DecodeError) as error:
+            if isinstance(error, sqlite3.Error) and not _is_damage(error):
+                raise _trouble(self.path, error) from error
+            mended = str(error)
+            for end in ("-wal", "-shm"):
+                database.with_name(DATABASE + end).unlink(missing_ok=True)
+            database.replace(database.with_name(DATABASE + ".damaged"))
+            _check(self.path)
+        on_disk = {p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")}
+        missing = sorted(set(self.spec.scenarios) & on_disk.keys() - self.finished(), key=on_disk.__getitem__)
+        taken = sum([self.adopt(scenario_id) for scenario_id in missing])
+        if mended:
+            self.notes.append(
+                f"{database} was damaged ({mended}): made anew from {taken} records on disk, kept as {DATABASE}.damaged"
+            )
 
 
 def read_spec(path: Path) -> RunSpec:
@@ -185,21 +231,84 @@ def read_spec(path: Path) -> RunSpec:
 def read_records(path: Path) -> list[Record]:
     """The records of a run folder, finished or not, in the order in which they ended."""
     read_spec(path)
-    if not (path / "results.sqlite").exists():
+    if not (path / DATABASE).exists():
+        if any(path.glob("episodes/*/record.json")):
+            raise RunError(f"{path / DATABASE} is gone: {REMEDY}")
         return []
     try:
         with closing(_connect(path)) as database:
-            rows: Sequence[tuple[str]] = database.execute("select record from episodes order by rowid").fetchall()
-        return [msgspec.json.decode(text, type=Record) for (text,) in rows]
-    except (sqlite3.Error, msgspec.DecodeError) as error:
-        raise RunError(f"{path / 'results.sqlite'}: {error}") from error
+            return _records(database)
+    except msgspec.DecodeError as error:
+        raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
+    except sqlite3.Error as error:
+        raise _trouble(path, error) from error
+
+
+def _refuse_used(path: Path) -> None:
+    """Raises RunError when a folder holds a run, or something else that is not a run's beginning."""
+    if (path / "run.json").exists():
+        raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
+    if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
+        raise RunError(f"{path} exists and is no run folder. Choose another --out.")
+
+
+def _locked(path: Path) -> int:
+    """The descriptor of the folder's lock. Raises RunError, naming the process that holds it."""
+    lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, str(os.getpid()).encode(), 0)
+    except BlockingIOError:
+        holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "?"
+        os.close(lock)
+        raise RunError(
+            f"{path} is in use by process {holder}: another cosim run is writing to it. "
+            "Wait for it to end, or choose another --out."
+        ) from None
+    except OSError:
+        os.close(lock)
+        raise
+    return lock
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path / "results.sqlite", timeout=30.0)
-    database.execute("pragma journal_mode = wal")
-    database.execute("pragma synchronous = full")
+    database = sqlite3.connect(path / DATABASE, timeout=30.0)
+    try:
+        database.execute("pragma journal_mode = wal")
+        database.execute("pragma synchronous = full")
+    except sqlite3.Error:
+        database.close()
+        raise
     return database
+
+
+def _check(path: Path) -> None:
+    """Read all of the database, made where there is none. Raises sqlite3.Error or DecodeError if it is damaged."""
+    with closing(_connect(path)) as database, database:
+        database.execute("create table if not exists episodes (scenario text primary key, row text, record text)")
+        faults = [fault for (fault,) in database.execute("pragma quick_check")]
+        if faults != ["ok"]:
+            raise sqlite3.DatabaseError(faults[0])
+        _records(database)
+
+
+def _records(database: sqlite3.Connection) -> list[Record]:
+    rows: Sequence[tuple[str]] = database.execute("select record from episodes order by rowid").fetchall()
+    return [msgspec.json.decode(text, type=Record) for (text,) in rows]
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether it is the file that is wrong, not the disk or who holds it."""
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    return code & 0xFF in DAMAGE or code == sqlite3.SQLITE_IOERR_SHORT_READ
+
+
+def _trouble(path: Path, error: sqlite3.Error) -> RunError | MachineError:
+    """What is said of an error of the database."""
+    if _is_damage(error):
+        return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
+    return MachineError(f"{path / DATABASE}: {error}. Finished episodes are safe: make room and add --resume.")
 
 
 def _brief(value: object) -> str:

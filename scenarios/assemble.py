@@ -12,7 +12,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim import overlay
 from cosim.clock import Clock
-from cosim.control import Limits
+from cosim.driver import Driver
 from cosim.injection import Injected
 from cosim.loop import Parts
 from cosim.ports import CameraSpec, Eyes, Policy
@@ -68,7 +68,8 @@ def staged(
     choice: what draws pictures. script: pedestrians that were injected into the episode that is replayed.
     direct: gives the director of its event pedestrians.
     """
-    manifest = policy.manifest
+    driver = Driver.of(policy)
+    manifest = driver.manifest
     clock = Clock.for_rate(manifest.rate_hz)
     net_path, street_map = place(scenario.place)
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
@@ -98,7 +99,7 @@ def staged(
         shapely.prepare(free)
         guests = Guests(director, clock.tick_ms, partial(on_map, street_map), script)
         roadway = Roadway(street_map, clock.tick_s)
-        parts = Parts(world, crowd, guests, policy, camera, Limits(), free)
+        parts = Parts(world, crowd, guests, driver, camera, free)
         yield Stage(parts, WalkableArea(walkable), clock, renderer, eyes, guests, roadway, crowd.entrances)
 
 

@@ -22,9 +22,10 @@ from typing import Any, NamedTuple, cast
 
 import msgspec
 
+from cosim.driver import Driver
 from cosim.errors import EngineError
 from cosim.policies.route import Route
-from cosim.ports import Camera, CameraSpec, Crowd, Director, Manifest, Policy, World
+from cosim.ports import Camera, CameraSpec, Crowd, Director, Manifest, World
 from cosim.scenario import City, CrowdSpec, Scenario
 from cosim.step import Reset, Step
 
@@ -109,9 +110,8 @@ def drive(size_m: float) -> Drive:
             cast(World, Timed(parts.world, "step", "physics", spent)),
             cast(Crowd, Timed(parts.crowd, "step", "crowd", spent)),
             cast(Director, Timed(parts.director, "react", "bridge", spent)),
-            cast(Policy, Timed(parts.policy, "act", "policy", spent)),
+            cast(Driver, Timed(parts.driver, "act", "policy", spent)),
             cast(Camera, Timed(parts.camera, "render", "camera", spent)),
-            parts.limits,
             parts.free,
         )
         referee, recorder = Referee(scenario, stage.area, parts.world.footprint_m, clock), Recorder(clock.tick_s)

@@ -17,9 +17,9 @@ import msgspec
 import numpy as np
 
 from cosim.clock import Clock
+from cosim.driver import Driver
 from cosim.errors import SpecError
 from cosim.policies.load import load_policy
-from cosim.ports import Policy
 from cosim.referee import STANDING_MPS, Verdict
 from cosim.scenario import City, Scenario
 from cosim.step import Step
@@ -28,7 +28,7 @@ from scenarios.crossings import build_all
 from scenarios.crowd_tally import Tally
 from scenarios.places import place
 from scenarios.run import Outcome, episode
-from scenarios.worker import die_with
+from scenarios.shepherd import end_with
 from sumo_nets.stoplines import StopLines
 
 SIZE_M = 2000.0
@@ -85,7 +85,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
     context = multiprocessing.get_context("spawn")
     names, done = [""] * count, 0
     try:
-        with ProcessPoolExecutor(1, context, initializer=die_with, initargs=(os.getpid(),)) as alone:
+        with ProcessPoolExecutor(1, context, initializer=end_with, initargs=(os.getpid(),)) as alone:
             scenarios = alone.submit(drawn, city, count).result()
             names = [scenario.id for scenario in scenarios]
             for scenario in scenarios:
@@ -103,7 +103,7 @@ def drawn(city: City, count: int) -> list[Scenario]:
 
 
 @cache
-def driver_of(policy: str) -> Policy:
+def driver_of(policy: str) -> Driver:
     """The policy of this process: the same one for all its crossings."""
     return load_policy(policy)
 

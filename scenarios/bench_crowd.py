@@ -18,7 +18,7 @@ import shapely
 from shapely.geometry import LineString
 
 from cosim.clock import Clock
-from cosim.control import Limits
+from cosim.driver import Driver
 from cosim.events import EventQuery, EventReply
 from cosim.geometry import Pose, wrap_angle
 from cosim.loop import Parts, steps
@@ -156,7 +156,7 @@ def drive(
     with crowd:
         timed = Stopwatch(crowd)
         director = among_residents(Directly(), scenario, street_map, ground, lambda: crowd.street.people)
-        parts = Parts(Glider(footprint_m), timed, director, Route(), None, Limits(), free)
+        parts = Parts(Glider(footprint_m), timed, director, Driver(Route()), None, free)
         lines = StopLines(clock.tick_s)
         run = steps(scenario, clock, parts)
         step = next(run)

@@ -26,7 +26,7 @@ from cosim.state import RobotState
 from cosim.streetmap import StreetMap
 from cosim.walks import WalkGraph
 from scenarios.places import place
-from scenarios.worker import die_with
+from scenarios.shepherd import end_with
 from sumo_nets.crowd import SumoCrowd
 
 BODIES = 3
@@ -86,7 +86,7 @@ def endure(where: Place, seed: int, minutes: float = 10.0, tell: Callable[[float
 
 
 def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -> None:
-    die_with(parent)
+    end_with(parent)
     so_far = Endured(place=where.name)
     try:
         for so_far in simulated(where, seed, ticks):

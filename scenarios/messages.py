@@ -8,8 +8,17 @@ import msgspec
 
 from bridge.director import Outside
 from cosim.injection import Live
+from cosim.ports import Manifest
 from cosim.record import Status
 from cosim.scenario import Scenario
+
+
+class Hello(msgspec.Struct, frozen=True, tag=True):
+    """The first message to an environment process: which policy it drives with, and what that was for the run."""
+
+    policy: str
+    manifest: Manifest
+    source_hash: str
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
@@ -27,6 +36,17 @@ class Job(msgspec.Struct, frozen=True, tag=True):
     live: Live | None = None
     outside: Outside | None = None
     counterfactual: bool = False
+
+
+class Ready(msgspec.Struct, frozen=True, tag=True):
+    """The engines are imported and the policy is loaded."""
+
+
+class Unable(msgspec.Struct, frozen=True, tag=True):
+    """No episode can be run here: the policy cannot be loaded (`blames_policy`), or the machine lacks something."""
+
+    reason: str
+    blames_policy: bool
 
 
 class Progress(msgspec.Struct, frozen=True, tag=True):
@@ -66,8 +86,9 @@ class Unsaved(msgspec.Struct, frozen=True, tag=True):
     reason: str
 
 
-Message = Progress | Waits | Compares | Done | Unsaved
+Message = Ready | Unable | Progress | Waits | Compares | Done | Unsaved
 
 encode = msgspec.msgpack.Encoder().encode
+decode_hello = msgspec.msgpack.Decoder(Hello).decode
 decode_job = msgspec.msgpack.Decoder(Job).decode
 decode_message = msgspec.msgpack.Decoder(Message).decode

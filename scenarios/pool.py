@@ -1,61 +1,46 @@
 """Runs scenarios in N environment processes on this machine.
 
-A process that dies (SUMO and PyBullet can take it down) is replaced and its scenario tried once more; one that shows
-no sign of life is killed. After the last attempt the episode is recorded as crashed, so that none is ever lost.
+A process that dies (SUMO and PyBullet can take it down) is replaced and its scenario tried once more; an engine that
+shows no sign of life is killed. After the last attempt the episode is recorded as crashed, so that none is ever lost.
+A policy that gives no answer in time is not asked again: its episode has crashed.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from multiprocessing.connection import Connection, wait
-from multiprocessing.context import SpawnProcess
-from pathlib import Path
+from multiprocessing.connection import wait
 
 import msgspec
 
 from bridge.director import Outside
-from cosim.errors import MachineError, unwritable
+from cosim.driver import Driver
+from cosim.errors import MachineError, UsageError, unwritable
 from cosim.injection import Live
-from cosim.ports import Manifest
 from cosim.record import begun
 from cosim.runfolder import RunFolder
 from cosim.scenario import Scenario
 from physics.cameras import CameraName
-from scenarios import worker
-from scenarios.messages import Done, Job, Message, Unsaved, decode_message, encode
+from scenarios.asked import Patience, Question
+from scenarios.messages import Done, Hello, Job, Message, Ready, Unable, Unsaved
+from scenarios.process import Process
 
 ATTEMPTS = 2
 SILENCE_S = 300.0
-"""A worker that says nothing for so long hangs; a slow policy says something once a simulated second."""
+"""A worker that says nothing for so long, while its policy has nothing to answer, hangs in an engine."""
 
 POLL_S = 1.0
-KEPT = "Finished episodes are kept; make room and go on with --resume"
+KEPT = "finished episodes are kept; make room and go on with --resume"
 
 Tell = Callable[[Message], None]
-
-
-@dataclass
-class _Worker:
-    """A worker process, its end of the pipe, and what it is busy with."""
-
-    process: SpawnProcess
-    pipe: Connection
-    log: Path
-    job: Scenario | None = None
-    heard_at: float = field(default_factory=time.monotonic)
 
 
 def run_all(
     folder: RunFolder,
     scenarios: Sequence[Scenario],
     policy: str,
-    manifest: Manifest,
+    driver: Driver,
     *,
     jobs: int,
     tell: Tell,
@@ -63,12 +48,20 @@ def run_all(
     camera: CameraName = "bullet",
     live: Live | None = None,
     outside: Outside | None = None,
+    patience: Patience = Patience(),  # noqa: B008  a frozen value
 ) -> None:
     """Run scenarios, `jobs` at a time, adding each record to the folder as it ends.
 
-    outside: the director of the event pedestrians, when the episodes have none of their own.
+    driver: the policy as it was loaded here; every process loads its own. outside: the director of the event
+    pedestrians, when the episodes have none of their own. Raises UsageError when a process cannot load the policy,
+    MachineError when none can be started.
     """
-    pool = _Pool(folder, policy, manifest, tell, frames_every_s, camera, live, outside)
+
+    def job(scenario: Scenario) -> Job:
+        target, spec = str(folder.episode_folder(scenario.id)), folder.spec
+        return Job(scenario, spec.suite_hash, target, frames_every_s, camera, live, outside, spec.counterfactual)
+
+    pool = _Pool(folder, Hello(policy, driver.manifest, driver.source_hash), job, tell, patience)
     waiting = deque(scenarios)
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
@@ -76,7 +69,7 @@ def run_all(
             while waiting and len(pool.busy) < jobs:
                 pool.give(waiting.popleft())
             for scenario, why in pool.listen():
-                attempts[scenario.id] += 1
+                attempts[scenario.id] += bool(why)
                 if attempts[scenario.id] < ATTEMPTS:
                     waiting.appendleft(scenario)
                 else:
@@ -85,25 +78,26 @@ def run_all(
         pool.close()
 
 
+class _Worker:
+    """An environment process and what it is busy with."""
+
+    def __init__(self, process: Process) -> None:
+        self.process = process
+        self.ready = False
+        self.job: Scenario | None = None
+        self.heard_at = time.monotonic()
+
+
 class _Pool:
     """The workers of one run."""
 
     def __init__(
-        self,
-        folder: RunFolder,
-        policy: str,
-        manifest: Manifest,
-        tell: Tell,
-        frames_every_s: float,
-        camera: CameraName,
-        live: Live | None,
-        outside: Outside | None,
+        self, folder: RunFolder, hello: Hello, job_of: Callable[[Scenario], Job], tell: Tell, patience: Patience
     ) -> None:
-        self._folder, self._policy, self._manifest = folder, policy, manifest
-        self._tell, self._frames_every_s, self._camera, self._live = tell, frames_every_s, camera, live
-        self._outside = outside
+        self._folder, self._hello, self._job_of = folder, hello, job_of
+        self._tell, self._patience = tell, patience
         self._workers: list[_Worker] = []
-        self._started = 0
+        self._started = self._failed_starts = 0
 
     @property
     def busy(self) -> list[_Worker]:
@@ -113,67 +107,83 @@ class _Pool:
         """Hand a scenario to an idle worker, or to a new one."""
         idle = next((w for w in self._workers if w.job is None), None) or self._start()
         idle.job, idle.heard_at = scenario, time.monotonic()
-        target = str(self._folder.episode_folder(scenario.id))
-        (Path(target) / "record.json").unlink(missing_ok=True)
-        try:
-            suite_hash = self._folder.spec.suite_hash
-            beside = self._folder.spec.counterfactual
-            job = Job(
-                scenario, suite_hash, target, self._frames_every_s, self._camera, self._live, self._outside, beside
-            )
-            idle.pipe.send_bytes(encode(job))
-        except BrokenPipeError:
-            idle.heard_at = time.monotonic()  # it died while idle: `listen` finds that out
+        self._folder.forget(scenario.id)
+        idle.process.send(self._job_of(scenario))
 
     def listen(self) -> list[tuple[Scenario, str]]:
-        """Take in what the workers say. Returns the scenarios whose worker was lost, and why."""
+        """Take in what the workers say. Returns the scenarios whose worker was lost, and why; "" if it never began."""
         lost = []
-        wait([w.pipe for w in self.busy], timeout=POLL_S)
+        wait([w.process.pipe for w in self.busy], timeout=POLL_S)
         for one in self.busy:
-            if self._hear(one):
+            if not self._hear(one):
+                lost += self._lost(one, one.process.end())
+            elif one.job is None:
                 continue
-            why = self._death(one)
-            self._workers.remove(one)
-            if one.job is None:
-                continue
-            if self._folder.adopt(one.job.id):
-                self._tell(Done(one.job.id, "done"))
-            else:
-                lost.append((one.job, why))
+            elif (question := one.process.asked.question) is not None:
+                one.heard_at = time.monotonic()
+                if question.overdue(self._patience):
+                    self._leave_unanswered(one, one.job, question)
+            elif time.monotonic() - one.heard_at > SILENCE_S:
+                one.process.kill()
+                lost += self._lost(one, "the environment process showed no sign of life")
         return lost
 
     def _hear(self, one: _Worker) -> bool:
-        """Everything a worker has said since; False when its pipe is closed or it has been silent."""
-        try:
-            while one.pipe.poll():
-                message = decode_message(one.pipe.recv_bytes())
-                one.heard_at = time.monotonic()
-                if isinstance(message, Unsaved):
-                    raise MachineError(f"{message.reason}. {KEPT}.")
-                if isinstance(message, Done):
-                    self._folder.adopt(message.scenario)
-                    one.job = None
-                self._tell(message)
-        except (EOFError, ConnectionResetError):
-            one.process.join(5.0)
-            return False
-        return one.job is None or time.monotonic() - one.heard_at < SILENCE_S
+        """Everything a worker has said since; False when its pipe is closed."""
+        for message in one.process.messages():
+            if message is None:
+                return False
+            one.heard_at = time.monotonic()
+            if isinstance(message, Unable):
+                raise UsageError(message.reason) if message.blames_policy else MachineError(message.reason)
+            if isinstance(message, Unsaved):
+                raise MachineError(f"{message.reason}: {KEPT}")
+            if isinstance(message, Ready):
+                one.ready, self._failed_starts = True, 0
+                continue
+            if isinstance(message, Done) and one.job is not None:
+                scenario, one.job = one.job, None
+                if not self._folder.adopt(scenario.id):
+                    self.give_up(scenario, "its record was gone or damaged right after it had been written")
+                    continue
+            self._tell(message)
+        return True
 
-    def _death(self, one: _Worker) -> str:
-        """How a worker ended; a hanging one is killed."""
-        one.pipe.close()
-        if one.process.is_alive():
-            one.process.kill()
-            one.process.join()
-            return "the environment process showed no sign of life"
-        code = one.process.exitcode or 0
-        if code < 0:
-            return f"the environment process was killed by {signal.Signals(-code).name}"
-        return f"the environment process ended with exit code {code}"
+    def _lost(self, one: _Worker, why: str) -> list[tuple[Scenario, str]]:
+        """A worker has ended. Returns its scenario if that is not done, and why."""
+        self._workers.remove(one)
+        if one.job is None:
+            return []
+        if self._folder.adopt(one.job.id):
+            self._tell(Done(one.job.id, "done"))
+            return []
+        if one.ready:
+            return [(one.job, why)]
+        self._not_started(one, why)
+        return [(one.job, "")]
+
+    def _leave_unanswered(self, one: _Worker, scenario: Scenario, question: Question) -> None:
+        """The policy takes too long: its process is killed, and its episode has crashed, once."""
+        one.process.kill()
+        self._workers.remove(one)
+        silent = f"policy '{self._hello.manifest.name}' gave no answer for {self._patience.of(question.doing):g} s"
+        if question.doing == "loading":
+            raise UsageError(f"{silent} while it was loaded in an environment process: give a longer --start-timeout")
+        self.give_up(scenario, f"{silent} in {question.when} of {scenario.id}")
+
+    def _not_started(self, one: _Worker, why: str) -> None:
+        """A worker that ended before it was ready. Raises the run's error when the next one has done so too."""
+        self._failed_starts += 1
+        if self._failed_starts < ATTEMPTS:
+            return
+        told = f"{why} before it was ready, {ATTEMPTS} times: see {one.process.log}"
+        if one.process.question is not None:
+            raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
+        raise MachineError(f"{told}, and `cosim doctor`")
 
     def give_up(self, scenario: Scenario, reason: str) -> None:
-        """Record a scenario that no worker survives as crashed."""
-        record = begun(scenario, self._manifest, self._folder.spec.suite_hash)
+        """Record a scenario as crashed: no worker survives it, or the policy does not answer."""
+        record = begun(scenario, self._hello.manifest, self._folder.spec.suite_hash, self._hello.source_hash)
         record = msgspec.structs.replace(record, reason=reason)
         target = self._folder.episode_folder(scenario.id)
         try:
@@ -188,28 +198,16 @@ class _Pool:
         """End every worker: idle ones by closing their pipe, busy ones by force."""
         for one in self._workers:
             if one.job is not None:
-                one.process.kill()
-            one.pipe.close()
+                one.process.kill(wait=False)
+            one.process.hang_up()
         for one in self._workers:
-            one.process.join(10.0)
-            if one.process.is_alive():
-                one.process.kill()
-                one.process.join()
+            one.process.end()
         self._workers.clear()
 
     def _start(self) -> _Worker:
-        context = multiprocessing.get_context("spawn")
-        mine, theirs = context.Pipe()
         log = self._folder.path / "logs" / f"worker-{self._started}.log"
-        process = context.Process(
-            target=worker.main,
-            args=(theirs, self._policy, str(log), os.getpid()),
-            name=f"cosim-env-{self._started}",
-            daemon=True,
-        )
-        process.start()
-        theirs.close()
+        one = _Worker(Process(log))
+        one.process.send(self._hello)
         self._started += 1
-        one = _Worker(process, mine, log)
         self._workers.append(one)
         return one

@@ -11,6 +11,7 @@ from typing import Any
 
 import msgspec
 
+from cosim.driver import Driver, said_by
 from cosim.errors import CosimError
 from cosim.injection import Live
 from cosim.loop import steps
@@ -58,10 +59,11 @@ def episode(
     it is compared with its street without the robot; comparing: is told how far that has come.
     """
     began = time.perf_counter()
-    record = begun(scenario, policy.manifest, suite_hash)
+    driver = Driver.of(policy)
+    record = begun(scenario, driver.manifest, suite_hash, driver.source_hash)
     beside, trouble = Beside(), ""
     try:
-        with staged(scenario, policy, camera, direct=direct) as stage:
+        with staged(scenario, driver, camera, direct=direct) as stage:
             record = replaced(record, renderer=stage.renderer)
             first_tick_s = time.perf_counter() - began
             with ExitStack() as air:
@@ -86,7 +88,7 @@ def episode(
 
 def in_words(error: Exception) -> str:
     """What a record says of an error: its message, with its type unless the project raised it on purpose."""
-    return str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {error}"
+    return str(error) if isinstance(error, CosimError) else f"{type(error).__name__}: {said_by(error)}"
 
 
 def drive(record: Record, scenario: Scenario, stage: Stage, *watches: Watch) -> tuple[Record, Log]:

@@ -1,61 +1,73 @@
 """One environment process: takes scenarios over a pipe, runs them, leaves their files, reports.
 
-Spawned, never forked. It dies with its parent; what the engines print goes to its log.
+It is started by its shepherd, which keeps its log and clears up after it (`scenarios.shepherd`).
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import shutil
 import signal
 import sys
+from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import cv2
-
 from cosim.clock import Clock
+from cosim.driver import Driver, said_by
+from cosim.errors import UsageError
 from cosim.policies.load import load_policy
 from cosim.referee import Verdict
 from cosim.step import Step
-from scenarios.messages import Compares, Done, Job, Message, Progress, Unsaved, Waits, decode_job, encode
+from scenarios.asked import Asked
+from scenarios.messages import (
+    Compares,
+    Done,
+    Hello,
+    Job,
+    Message,
+    Progress,
+    Ready,
+    Unable,
+    Unsaved,
+    Waits,
+    decode_hello,
+    decode_job,
+    encode,
+)
 
 if TYPE_CHECKING:
     from scenarios.directing import Direct
-    from scenarios.run import Watch
+    from scenarios.run import Outcome, Watch
 
 REPORT_EVERY_TICKS = 20
-PR_SET_PDEATHSIG = 1
+CANNOT_START = "an environment process cannot start:"
 
 
-def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
-    """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew.
-
-    parent: process id of the run that started this one; without it there is nobody to work for.
-    """
-    die_with(parent)
+def main(pipe_descriptor: int, asked_descriptor: int) -> None:
+    """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    with Path(log_path).open("ab", buffering=0) as log:
-        os.dup2(log.fileno(), 1)
-        os.dup2(log.fileno(), 2)
-    from scenarios.run import episode  # the engines greet on stdout when they are imported
-
-    driver = load_policy(policy)
+    pipe, home = Connection(pipe_descriptor), Path.cwd()
+    hello = decode_hello(pipe.recv_bytes())
+    episode = engines(pipe)
+    timer = Asked(asked_descriptor)
+    driver: Driver | None = loaded(hello, timer, pipe)
+    send(pipe, Ready())
     while True:
         try:
             job = decode_job(pipe.recv_bytes())
         except EOFError:
             return
-        watch = watcher(job, pipe)
+        os.chdir(home)  # the policy may have gone elsewhere
+        driver = driver or loaded(hello, timer, pipe)
         outcome = episode(
             job.scenario,
             driver,
             suite_hash=job.suite_hash,
             camera=job.camera,
-            watch=watch,
+            watch=watcher(job, pipe),
             live=job.live,
             direct=director_of(job, pipe),
             counterfactual=job.counterfactual,
@@ -63,16 +75,48 @@ def main(pipe: Connection, policy: str, log_path: str, parent: int) -> None:
         )
         if outcome.traceback:
             print(f"--- {job.scenario.id}\n{outcome.traceback}", file=sys.stderr, flush=True)
-            driver = load_policy(policy)
-        folder = Path(job.folder)
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            if outcome.log is not None:
-                outcome.log.save(folder / "trajectory.npz")
-            outcome.record.save(folder / "record.json")
-        except OSError as error:
-            send(pipe, Unsaved(job.scenario.id, f"{folder}: {error.strerror}"))
-            continue
+            driver = None  # made anew for the next one
+        leave(job, outcome, pipe)
+
+
+def engines(pipe: Connection) -> Callable[..., Outcome]:
+    """`scenarios.run.episode`. An engine that cannot be imported is told, and ends the process."""
+    try:
+        from scenarios.run import episode  # the engines greet on stdout when they are imported
+    except (ImportError, OSError) as error:
+        send(pipe, Unable(f"{CANNOT_START} {said_by(error)}. `cosim doctor` says more", blames_policy=False))
+        raise
+    return episode
+
+
+def loaded(hello: Hello, timer: Asked, pipe: Connection) -> Driver:
+    """The policy of the run. One that cannot be loaded here, or is another one here, is told, and ends the process."""
+    try:
+        driver = load_policy(hello.policy, timer)
+        if driver.source_hash != hello.source_hash:
+            raise UsageError(f"policy '{hello.policy}' was edited while the run was going on: begin another run")
+        if driver.manifest != hello.manifest:
+            raise UsageError(
+                f"policy '{hello.policy}' has another manifest in each process: {driver.manifest} in this one, "
+                f"{hello.manifest} in the first"
+            )
+    except UsageError as error:
+        send(pipe, Unable(str(error), blames_policy=True))
+        raise
+    return driver
+
+
+def leave(job: Job, outcome: Outcome, pipe: Connection) -> None:
+    """Write what came out of an episode, and report it."""
+    folder = Path(job.folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if outcome.log is not None:
+            outcome.log.save(folder / "trajectory.npz")
+        outcome.record.save(folder / "record.json")
+    except OSError as error:
+        send(pipe, Unsaved(job.scenario.id, f"{folder}: {error.strerror}"))
+    else:
         send(pipe, Done(job.scenario.id, outcome.record.status))
 
 
@@ -92,6 +136,8 @@ def comparing(job: Job, pipe: Connection, share: float) -> None:
 
 def watcher(job: Job, pipe: Connection) -> Watch:
     """Reports progress, and keeps camera frames where the job asks for them."""
+    import cv2
+
     failures = 0
     next_frame_s = 0.0
     frames = Path(job.folder) / "frames"
@@ -117,12 +163,4 @@ def send(pipe: Connection, message: Message) -> None:
     try:
         pipe.send_bytes(encode(message))
     except OSError:
-        os._exit(1)
-
-
-def die_with(parent: int) -> None:
-    """Ask Linux to kill this process when its parent dies, however that happens; end if it is dead already."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:
         os._exit(1)

@@ -50,7 +50,8 @@ def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
         suite="s", suite_version="1", suite_hash="h", policy="p", policy_name="p", policy_version="1", scenarios=(),
         versions={}, renderer="bullet-tiny",
     )  # fmt: skip
-    RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=()))
+    with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
+        pass
     other = RunSpec(**{f: getattr(spec, f) for f in spec.__struct_fields__} | {"renderer": "gl: other"})
     with pytest.raises(RunError, match="its renderer is bullet-tiny, now asked for is gl: other"):
         RunFolder.resume(tmp_path / "run", other)

@@ -75,7 +75,7 @@ class DiskFull(Base):
         from cosim.record import Log
         save = Log.save
         def failing(log, path):
-            if "t-1" in str(path): raise OSError(28, "No space left on device")
+            if path.parent.name == "t-1": raise OSError(28, "No space left on device")
             save(log, path)
         if self.count == 0: Log.save = failing
         self.count += 1
@@ -242,7 +242,7 @@ def children(pid: int) -> list[int]:
     task = Path(f"/proc/{pid}/task/{pid}/children")
     pids = [int(word) for word in task.read_text().split()] if task.exists() else []
     lines = {p: Path(f"/proc/{p}/cmdline") for p in pids}
-    return [p for p, line in lines.items() if line.exists() and b"spawn_main" in line.read_bytes()]
+    return [p for p, line in lines.items() if line.exists() and b"scenarios.shepherd" in line.read_bytes()]
 
 
 def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: Cosim) -> None:

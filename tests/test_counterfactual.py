@@ -113,7 +113,8 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, t
 def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_path: Path) -> None:
     """Between the last progress of an episode of five seconds and its end it tells five times how far it is."""
     short = Suite(name="s", version="1", scenarios=(msgspec.structs.replace(scenario, time_limit_s=5.0),))
-    manifest = load_policy("orca").manifest
+    driver = load_policy("orca")
+    manifest = driver.manifest
     spec = RunSpec(
         suite="s",
         suite_version="1",
@@ -127,7 +128,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     )
     told: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
-        run_all(folder, short.scenarios, "orca", manifest, jobs=1, tell=told.append)
+        run_all(folder, short.scenarios, "orca", driver, jobs=1, tell=told.append)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
 

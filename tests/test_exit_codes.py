@@ -47,6 +47,7 @@ def test_every_error_has_its_exit_code() -> None:
         (("list", "--wrong"), 2),
         (("list", "broken.json"), 2),
         (("run", "long-horizon", "--policy", "nobody"), 2),
+        (("run", "long-horizon", "--policy", "sys:exit"), 2),
         (("city", "make", "--seed", "1", "--size", "1", "small"), 2),
         (("map", "import", "nothing.osm"), 2),
         (("show", "damaged"), 2),
@@ -81,6 +82,17 @@ def test_what_a_command_raises_is_its_exit_code(
 
     monkeypatch.setattr("scenarios.catalog.suite", raises)
     assert ended(monkeypatch, "list") == code
+
+
+def test_a_run_with_fewer_records_than_scenarios_is_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """However it came about, the scenarios without a record are named and the exit code is 1."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("scenarios.pool.run_all", lambda *_, **__: None)
+    words = ("run", "reactive", "--policy", "orca", "--episodes", "2", "--out", "run")
+    assert ended(monkeypatch, *words) == 1
+    assert "No record of obstructing-001, conversing-001: run it again with --resume" in capsys.readouterr().err
 
 
 def test_the_readme_tells_the_exit_codes() -> None:

@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 from shapely.geometry import box
 
-from cosim.control import Limits
+from cosim.driver import Driver
 from cosim.events import GROUPS, Kind
 from cosim.geometry import Polyline, Pose
-from cosim.loop import ask
 from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
@@ -67,10 +66,10 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
     limits = [stop_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
     assert limits == sorted(limits, reverse=True) and limits[-1] == 0.0 and limits[0] > 2.0
     assert stop_limit(known(nobody, 9.9)) == math.inf
-    policy, limit = Orca(), Limits()
+    driver = Driver(Orca())
     x_m, v_mps = 3.0, 0.0
     for tick in range(300):
-        command = ask(policy, Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, known(hand, x_m, v_mps)), limit)
+        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, known(hand, x_m, v_mps)))
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
         x_m += 0.1 * v_mps
     assert v_mps == 0.0

@@ -12,10 +12,10 @@ import shapely
 from shapely.geometry import LineString
 
 from cosim.clock import Clock
-from cosim.control import Limits
+from cosim.driver import Driver
 from cosim.errors import MapError
 from cosim.geometry import Polyline, Pose, wrap_angle
-from cosim.loop import ask, observe, place_on_route
+from cosim.loop import observe, place_on_route
 from cosim.policies.route import Route
 from cosim.ports import Privileged
 from cosim.scenario import City
@@ -74,13 +74,13 @@ class Climb(NamedTuple):
 def climb(world: BulletWorld, line: Polyline) -> Climb:
     """Drive a line with the `route` policy at its own rate, in an empty street."""
     state, street, clock = world.place(Pose(*line.at(0.0))), Street(0), Clock.for_rate(Route.manifest.rate_hz)
-    policy, command, tick = Route(), STILL, 0
+    driver, command, tick = Driver(Route()), STILL, 0
     free = shapely.buffer(LineString(line.points), 1.0)
     track, tilt, reached = [state.pose.xy], 0.0, 0.0
     while reached < line.length_m - 0.4 and clock.time_s(tick) < 5.0 + 2.5 * line.length_m / V_MPS:
         if clock.acts(tick):
             known = Privileged(state, line, reached, NOBODY, NO_VEHICLES, {}, (), free)
-            command = ask(policy, observe(tick, clock, state, None, known), Limits())
+            command = driver.act(observe(tick, clock, state, None, known))
         state = world.step(command, street, street, clock.substeps).robot
         reached = place_on_route(line, state.pose, reached)
         tilt, tick = max(tilt, state.tilt_rad), tick + 1

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import sqlite3
+import subprocess
+import sys
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -12,7 +17,7 @@ from cosim.errors import RunError, UsageError
 from cosim.metrics import METRICS
 from cosim.record import Log, Record
 from cosim.results import summary_of, table_of
-from cosim.runfolder import RunFolder, RunSpec, read_records
+from cosim.runfolder import RunFolder, RunSpec, read_records, read_spec
 from cosim.scenario import City, Scenario, Suite
 
 
@@ -51,11 +56,14 @@ def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: 
 
 def test_a_folder_that_holds_a_run_is_not_overwritten(tmp_path: Path) -> None:
     """A second run into a folder is refused, and so is a folder of other things; a run killed at once begins anew."""
-    RunFolder.create(tmp_path / "run", SPEC, SUITE)
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
     with pytest.raises(RunError, match=r"already holds a run\. Add --resume"):
         RunFolder.create(tmp_path / "run", SPEC, SUITE)
     (tmp_path / "begun/episodes").mkdir(parents=True)
-    RunFolder.create(tmp_path / "begun", SPEC, SUITE)
+    (tmp_path / "begun/lock").touch()
+    with RunFolder.create(tmp_path / "begun", SPEC, SUITE) as folder:
+        assert folder.finished() == set()
     (tmp_path / "other").mkdir()
     (tmp_path / "other/photo.png").touch()
     with pytest.raises(RunError, match="is no run folder"):
@@ -68,22 +76,147 @@ def test_a_folder_in_use_is_refused(tmp_path: Path) -> None:
         RunFolder.resume(tmp_path / "run", SPEC).__enter__()
 
 
+def test_a_folder_is_locked_before_it_is_written(tmp_path: Path) -> None:
+    """Of two runs that find the same folder empty at the same moment the second one writes nothing."""
+    mine, other = msgspec.structs.replace(SPEC, policy="p"), msgspec.structs.replace(SPEC, policy="q")
+    first, second = (RunFolder.create(tmp_path / "run", spec, SUITE) for spec in (mine, other))
+    with first, pytest.raises(RunError, match=r"in use by process \d+"):
+        second.__enter__()
+    with pytest.raises(RunError, match="already holds a run"):
+        second.__enter__()
+    assert read_spec(tmp_path / "run") == mine
+    with RunFolder.resume(tmp_path / "run", mine):
+        pass
+
+
+def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A relative path means the folder it meant when the run began, wherever the process goes."""
+    monkeypatch.chdir(tmp_path)
+    with RunFolder.create(Path("run"), SPEC, SUITE) as folder:
+        monkeypatch.chdir("/")
+        folder.add(record("s-0"))
+        assert folder.finished() == {"s-0"} and folder.episode_folder("s-0") == tmp_path / "run/episodes/s-0"
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("policy", "q"),
         ("suite_version", "2-groups0.4"),
         ("suite_hash", "0"),
+        ("renderer", "other"),
         ("versions", {"numpy": "1"}),
         ("counterfactual", True),
     ],
 )
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
     """Another policy, suite or version would mix two runs: the difference is named."""
-    RunFolder.create(tmp_path / "run", SPEC, SUITE)
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
     other = msgspec.structs.replace(SPEC, **{field: value})
     with pytest.raises(RunError, match=f"is of another run: its {field} is"):
         RunFolder.resume(tmp_path / "run", other)
+
+
+def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:
+    """Also when its version was left as it was: the policy is named."""
+    spec = msgspec.structs.replace(SPEC, policy_source="1111")
+    with RunFolder.create(tmp_path / "run", spec, SUITE):
+        pass
+    with pytest.raises(RunError, match="is of another run: the source of policy 'p' was edited since it began"):
+        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(SPEC, policy_source="2222"))
+    with RunFolder.resume(tmp_path / "run", spec):
+        pass
+
+
+def garbage(database: Path) -> None:
+    database.write_bytes(b"nothing that sqlite wrote" * 1000)
+
+
+def cut_off(database: Path) -> None:
+    database.write_bytes(database.read_bytes()[:5000])
+
+
+def overwritten(database: Path) -> None:
+    body = bytearray(database.read_bytes())
+    body[4096:8192] = b"\xff" * 4096
+    database.write_bytes(bytes(body))
+
+
+def another_table(database: Path) -> None:
+    database.unlink()
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("create table episodes (name text)")
+
+
+def odd_rows(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("update episodes set record = '{'")
+
+
+DAMAGES = {damage.__name__: damage for damage in (garbage, cut_off, overwritten, another_table, odd_rows)}
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: str) -> None:
+    """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every record on disk."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        for i in (2, 0):
+            folder.episode_folder(f"s-{i}").mkdir()
+            record(f"s-{i}").save(folder.episode_folder(f"s-{i}") / "record.json")
+            os.utime(folder.episode_folder(f"s-{i}") / "record.json", (0, 10 - i))
+            folder.adopt(f"s-{i}")
+    DAMAGES[name](tmp_path / "run/results.sqlite")
+    with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"):
+        read_records(tmp_path / "run")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-0", "s-2"}
+        (note,) = again.notes
+        assert "results.sqlite was damaged (" in note and "made anew from 2 records" in note
+    assert [r.scenario for r in read_records(tmp_path / "run")] == ["s-2", "s-0"]
+    assert (tmp_path / "run/results.sqlite.damaged").exists()
+
+
+def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
+    """A run that was killed leaves a write-ahead log; when it is deleted, or everything is, the records count."""
+    for lost in ("results.sqlite-wal", "results.sqlite"):
+        path = tmp_path / lost
+        code = (
+            "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
+            "from test_runfolder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, SUITE).__enter__();"
+            "keep = sqlite3.connect(held.path / 'results.sqlite'); keep.execute('select * from episodes').fetchall();"
+            "held.episode_folder('s-1').mkdir(); record('s-1').save(held.episode_folder('s-1') / 'record.json');"
+            "held.adopt('s-1'); os.kill(os.getpid(), 9)"
+        )
+        killed = subprocess.run([sys.executable, "-c", code, str(path), str(Path(__file__).parent)], check=False)
+        assert killed.returncode == -9 and (path / "results.sqlite-wal").stat().st_size > 0
+        (path / lost).unlink()
+        with RunFolder.resume(path, SPEC) as again:
+            assert again.finished() == {"s-1"}
+        assert [r.scenario for r in read_records(path)] == ["s-1"]
+
+
+def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
+    """`show` says the remedy."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.episode_folder("s-0").mkdir()
+        record("s-0").save(folder.episode_folder("s-0") / "record.json")
+    (tmp_path / "run/results.sqlite").unlink()
+    with pytest.raises(RunError, match=r"results\.sqlite is gone: .*--resume"):
+        read_records(tmp_path / "run")
+
+
+def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
+    """Neither a broken record nor one of another scenario counts as finished; which it was is said."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        for i in range(3):
+            folder.episode_folder(f"s-{i}").mkdir()
+        (folder.episode_folder("s-0") / "record.json").write_text("{")
+        record("s-2").save(folder.episode_folder("s-1") / "record.json")
+        record("s-2").save(folder.episode_folder("s-2") / "record.json")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-2"}
+        assert len(again.notes) == 2 and all(note.endswith("This episode is run again.") for note in again.notes)
 
 
 def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
@@ -112,7 +245,8 @@ def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
     """What is no run folder is answered with the runs that lie beside it."""
-    RunFolder.create(tmp_path / "mine", SPEC, SUITE)
+    with RunFolder.create(tmp_path / "mine", SPEC, SUITE):
+        pass
     with pytest.raises(UsageError, match=r"unknown run .*other'\. Valid choices: mine"):
         read_records(tmp_path / "other")
 

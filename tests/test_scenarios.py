@@ -14,6 +14,7 @@ from shapely.geometry import LineString, Point, Polygon, box
 
 from cosim.clock import Clock
 from cosim.control import Limits
+from cosim.driver import Driver
 from cosim.errors import SpecError, UsageError
 from cosim.events import Event, EventQuery
 from cosim.geometry import Polyline
@@ -273,17 +274,16 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
 @pytest.mark.parametrize("name", POLICIES)
 def test_every_policy_answers_within_its_manifest(name: str) -> None:
     """Every shipped policy resets, acts and stays within the robot's limits on an empty street."""
-    from cosim.loop import ask
     from cosim.ports import Observation
 
-    policy, limits = POLICIES[name](), Limits()
-    Clock.for_rate(policy.manifest.rate_hz)
+    driver, limits = Driver(POLICIES[name]()), Limits()
+    Clock.for_rate(driver.manifest.rate_hz)
     route = Polyline([(0, 0), (50, 0)])
-    policy.reset("t", 0)
+    driver.reset("t", 0)
     for tick in range(0, 200, 2):
         robot = RobotState(route.at(tick * 0.05), 1.0)
         known = Privileged(robot, route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2))
-        command = ask(policy, Observation(tick, tick * 0.05, None, 1.0, 0.0, known), limits)
+        command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, known))
         assert 0.0 <= command.v_mps <= limits.v_mps and abs(command.w_radps) <= limits.w_radps
 
 

@@ -2,41 +2,131 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
+import inspect
+import math
+import os
+import signal
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from cosim.errors import UsageError, unknown
+import msgspec
+
+from cosim.clock import Clock
+from cosim.driver import Driver, Timer, told_of
+from cosim.errors import SpecError, UsageError, unknown
 from cosim.policies import POLICIES
-from cosim.ports import Manifest, Policy
+from cosim.ports import CameraSpec, Manifest, Policy
+
+MOST_PX = 4096
+LONGEST_NAME = 100
 
 
-def load_policy(name: str) -> Policy:
-    """A new policy. Raises UsageError when the name means nothing or the class is no policy."""
+def load_policy(name: str, timer: Timer | None = None) -> Driver:
+    """A new policy, its manifest read. Raises UsageError when the name means nothing or the class is no policy.
+
+    timer: is told while the policy is loaded and whenever it is asked.
+    """
     if ":" not in name:
         if name not in POLICIES:
             raise unknown("policy", name, [*POLICIES, "package.module:Class"])
-        return POLICIES[name]()
+        policy = POLICIES[name]()
+        return Driver(policy, source_hash=source_hash(policy), timer=timer)
+    process, home = os.getpid(), Path.cwd()
+    if timer is not None:
+        timer.starts("loading", 0)
+    try:
+        policy = _made(name)
+        manifest = _checked(name, policy)
+        return Driver(policy, manifest, source_hash(policy), timer)
+    finally:
+        if os.getpid() != process:
+            os._exit(1)  # a child that the user's code has forked
+        os.chdir(home)  # the user's code may have gone elsewhere
+        if timer is not None:
+            timer.stops()
+
+
+def source_hash(policy: Policy) -> str:
+    """Of the files in which the policy's class and its base classes are written; "" when none can be read.
+
+    What these import, and weights that they read, is not covered: a manifest's version is to tell that.
+    """
+    digest, read = hashlib.blake2b(digest_size=8), False
+    for one in type(policy).__mro__:
+        try:
+            source = Path(inspect.getfile(one)).read_bytes()
+        except (OSError, TypeError):  # built in, or made without a file
+            continue
+        digest.update(f"{one.__module__}\0{len(source)}\0".encode() + source)
+        read = True
+    return digest.hexdigest() if read else ""
+
+
+def _made(name: str) -> Policy:
+    """The object that `package.module:Class` makes."""
     module_name, _, class_name = name.partition(":")
     here = str(Path.cwd())
     if here not in sys.path:
         sys.path.insert(0, here)
-    try:
+    with _in_words(f"policy '{name}': module '{module_name}' cannot be imported:"):
         module = importlib.import_module(module_name)
-    except Exception as error:
-        raise UsageError(
-            f"policy '{name}': module '{module_name}' cannot be imported: {type(error).__name__}: {error}"
-        ) from error
     if not hasattr(module, class_name):
         classes = sorted(k for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__)
         raise unknown(f"class in module '{module_name}'", class_name, classes)
-    try:
+    with _in_words(f"policy '{name}' cannot be made:"):
         policy: Policy = getattr(module, class_name)()
-    except Exception as error:
-        raise UsageError(f"policy '{name}' cannot be made: {type(error).__name__}: {error}") from error
-    if not isinstance(getattr(policy, "manifest", None), Manifest):
-        raise UsageError(f"policy '{name}' has no attribute 'manifest' that is a cosim.ports.Manifest")
-    for method in ("reset", "act"):
-        if not callable(getattr(policy, method, None)):
-            raise UsageError(f"policy '{name}' has no method '{method}'; see cosim.ports.Policy")
     return policy
+
+
+def _checked(name: str, policy: Policy) -> Manifest:
+    """A copy of the policy's manifest. Raises UsageError when it has none, or lacks a method."""
+    with _in_words(f"policy '{name}': its manifest:"):
+        manifest = getattr(policy, "manifest", None)
+        lacking = [method for method in ("reset", "act") if not callable(getattr(policy, method, None))]
+    if not isinstance(manifest, Manifest):
+        raise UsageError(f"policy '{name}' has no attribute 'manifest' that is a cosim.ports.Manifest")
+    if lacking:
+        raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.ports.Policy")
+    try:
+        manifest = msgspec.convert(msgspec.to_builtins(manifest), Manifest)
+        Clock.for_rate(manifest.rate_hz)
+        if wrong := _wrong(manifest):
+            raise UsageError(f"policy '{name}': its manifest's {wrong}")
+    except (msgspec.ValidationError, SpecError, TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"policy '{name}': its manifest: {error}") from error
+    return manifest
+
+
+def _wrong(manifest: Manifest) -> str:
+    """What is wrong with the values of a manifest; "" if nothing is."""
+    for field, text in (("name", manifest.name), ("version", manifest.version)):
+        if not 0 < len(text) <= LONGEST_NAME or not text.isprintable() or "/" in text or text.startswith("."):
+            return f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without '/', not {text!r:.80}"
+    if not (math.isfinite(manifest.waypoint_dt_s) and manifest.waypoint_dt_s > 0.0):
+        return f"waypoint_dt_s must be a positive number of seconds, not {manifest.waypoint_dt_s}"
+    return "" if manifest.camera is None else _wrong_camera(manifest.camera)
+
+
+def _wrong_camera(camera: CameraSpec) -> str:
+    if not all(1 <= side <= MOST_PX for side in (camera.width, camera.height)):
+        return f"camera must have sides of 1 to {MOST_PX} pixels, not {camera.width} x {camera.height}"
+    if not 0.0 < camera.fov_deg < 180.0:
+        return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
+    if not all(map(math.isfinite, (*camera.mount_m, camera.pitch_down_deg))):
+        return f"camera mount_m and pitch_down_deg must be finite, not {camera.mount_m}, {camera.pitch_down_deg}"
+    return ""
+
+
+@contextmanager
+def _in_words(what: str) -> Iterator[None]:
+    """Whatever the user's code raises, SystemExit included, as a UsageError; Ctrl-C stays what it is."""
+    try:
+        yield
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+            raise
+        raise UsageError(f"{what} {told_of(error).removeprefix('raised ')}") from error
