@@ -77,7 +77,7 @@ def run(
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
     map_name: Annotated[
-        str | None, typer.Option("--map", help="Draw routes on this map (`cosim map list`) in place of the suite's.")
+        str | None, typer.Option("--map", help="Draw on this place in place of the suite's: a map, a folder, a net.")
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the routes drawn with --map.")] = 0,
     roughness: Annotated[
@@ -129,7 +129,9 @@ def run(
     if map_name is not None:
         from scenarios.sample import suite_on_map
 
-        whole = suite_on_map(suite, map_name, seed, episodes or 1, roughness or 0.0)
+        with doing(f"drawing routes on {map_name}"):
+            whole = suite_on_map(suite, map_name, seed, episodes, roughness or 0.0, event or ())
+        err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
     elif roughness is not None:
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:

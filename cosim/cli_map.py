@@ -67,7 +67,7 @@ def import_(
     "`cosim map check sumo-fkk-in --json`"
 )
 def check(
-    place: Annotated[str, typer.Argument(metavar="MAP", help="A map of `cosim map list`, or a .net.xml(.gz) file.")],
+    place: Annotated[str, typer.Argument(metavar="MAP", help="A map, a folder of a city or map, a .net.xml(.gz).")],
     picture: Annotated[Path | None, typer.Option("-o", "--output", help="Write a picture of it, a PNG.")] = None,
     zoom: Annotated[str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
@@ -98,23 +98,21 @@ def check(
     epilog="Examples:  \n`cosim map endure bologna`  \n`cosim map endure bologna wildau --minutes 30 --seed 1`"
 )
 def endure(
-    maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps of `cosim map list`.")],
+    maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps, folders of cities or maps, nets.")],
     minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,
 ) -> None:
     """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit code 1: SUMO died."""
     from cosim.clock import Clock
-    from cosim.scenario import CityMap
     from scenarios.endure import endure as endured_on
-    from sumo_nets.mapstore import map_net
+    from sumo_nets.placenames import place_called
 
-    for name in maps:
-        map_net(name)
+    places = [place_called(name) for name in maps]
     table = Table("map", "simulated min", "persons", "vehicles", "wall s", "ended by", box=box.SIMPLE_HEAD)
     failed = False
-    for name in maps:
+    for name, where in zip(maps, places, strict=True):
         with doing(f"{minutes:g} min on {name}") as tell:
-            done = endured_on(CityMap(map=name), seed, minutes, partial(tell, f"{minutes:g} min on {name}"))
+            done = endured_on(where, seed, minutes, partial(tell, f"{minutes:g} min on {name}"))
         failed |= bool(done.reason)
         simulated_min = Clock().time_s(done.ticks) / 60.0
         cells = (f"{simulated_min:.1f}", f"{done.persons:.0f}", f"{done.vehicles:.0f}", f"{done.wall_s:.0f}")
@@ -177,18 +175,24 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
     ]
 
 
-def _look_up(place: str) -> tuple[StreetMap, MapCheck, About | None]:
-    from sumo_nets.mapstore import checked_map
-
-    path = Path(place)
-    if not path.is_file():
-        return checked_map(place)
-    if not path.name.endswith((".net.xml", ".net.xml.gz", "net.xml")):
-        raise MapError(f"{path}: only SUMO nets can be checked as they are: import it first with `cosim map import`")
+def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
+    """What is known of a place by whatever it is called; a net that was not imported is checked as it is."""
     from cosim.mapcheck import check_map
+    from cosim.scenario import CityMap
     from sumo_nets.atlas import street_map_of
+    from sumo_nets.mapstore import checked_map
     from sumo_nets.netfacts import read_facts
+    from sumo_nets.placenames import place_called
+    from sumo_nets.store import city_net
 
+    path = Path(called)
+    if not path.is_file():
+        where = place_called(called)
+        if isinstance(where, CityMap):
+            return checked_map(where.map)
+        path = city_net(where)
+    elif not path.name.endswith((".net.xml", ".net.xml.gz", "net.xml")):
+        raise MapError(f"{path}: only SUMO nets can be checked as they are: import it first with `cosim map import`")
     street_map = street_map_of(path)
     return street_map, check_map(street_map, None, read_facts(path)), None
 

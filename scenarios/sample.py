@@ -2,44 +2,102 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import msgspec
 import numpy as np
 import shapely
 
-from cosim.errors import unknown
+from cosim.errors import MapError, SpecError, unknown
+from cosim.events import GROUPS, Kind
 from cosim.geometry import Polyline
-from cosim.scenario import CityMap, Scenario, Suite
+from cosim.scenario import CityMap, Place, Scenario, Suite
 from cosim.streetmap import StreetMap, Strip
 from cosim.walks import WalkGraph
-from scenarios.long_horizon import build
+from scenarios import long_horizon, reactive
 from scenarios.places import place
+from sumo_nets.placenames import place_called
 
+KINDS = ("long-horizon", "reactive")
 PERSON_M2 = 25.0
 """Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
 
 SAMPLE_M = 20.0
 
 
-def suite_on_map(kind: str, name: str, seed: int, count: int, roughness: float = 0.0) -> Suite:
-    """`count` long-horizon scenarios on a map; the same arguments and net give the same suite.
+def suite_on_map(
+    kind: str, called: str, seed: int, count: int | None, roughness: float = 0.0, events: Sequence[str] = ()
+) -> Suite:
+    """A suite drawn on a place, by whatever the user calls it; the same arguments and net give the same suite.
 
-    Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
+    count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one of each by default.
+    events: which of them; those for which the place has no room are left out, and the description says so, unless they
+    were asked for. Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
     roughness: of the ground, from 0 (flat) to 1.
 
-    Raises UsageError for another kind of suite, and whatever the map or the builder has to refuse.
+    Raises UsageError for another kind of suite, and whatever the place or the builder has to refuse.
     """
-    if kind != "long-horizon":
-        raise unknown("suite for --map", kind, ["long-horizon"])
-    where = CityMap(map=name, roughness=roughness)
+    if kind not in KINDS:
+        raise unknown("suite for --map", kind, KINDS)
+    for event in events:
+        if event not in GROUPS:
+            raise unknown("event", event, GROUPS)
+    where = place_called(called, roughness)
     _, street_map = place(where)
-    graph = WalkGraph(street_map)
-    drawn = (build(where, street_map, graph, seed + i, f"{name}-{seed + i:03d}") for i in range(count))
-    scenarios = tuple(thinned(scenario, street_map) for scenario in drawn)
+    name = where.map if isinstance(where, CityMap) else where.name
+    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed)
+    scenarios, left_out = drawn.long(count or 1) if kind == "long-horizon" else drawn.reactive(count, events)
     return Suite(
-        name="long-horizon",
+        name=kind,
         version=f"map-{name}-{seed}" + (f"-rough{roughness:g}" if roughness else ""),
-        scenarios=scenarios,
+        scenarios=tuple(thinned(scenario, street_map) for scenario in scenarios),
+        description=f"Drawn on {name}. {' '.join(left_out)}".strip(),
     )
+
+
+class _Drawn(NamedTuple):
+    """What scenarios are drawn on. seed: of the first one."""
+
+    where: Place
+    street_map: StreetMap
+    graph: WalkGraph
+    name: str
+    seed: int
+
+    def long(self, count: int) -> tuple[list[Scenario], list[str]]:
+        """So many long-horizon scenarios; nothing is left out."""
+        seeds = range(self.seed, self.seed + count)
+        ids = [f"{self.name}-{seed:03d}" for seed in seeds]
+        build = long_horizon.build
+        return [build(self.where, self.street_map, self.graph, n, i) for n, i in zip(seeds, ids, strict=True)], []
+
+    def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
+        """So many reactive scenarios, their events in turn, and a sentence for each event there is no room for."""
+        kinds = [kind for kind in GROUPS if kind in asked or not asked]
+        found: list[Scenario] = []
+        left_out: list[str] = []
+        for seed in itertools.count(self.seed):
+            for kind in list(kinds):
+                try:
+                    found.append(self._one(kind, seed))
+                except (SpecError, MapError) as refusal:
+                    if asked:
+                        raise
+                    kinds.remove(kind)
+                    left_out.append(f"No '{kind}': {refusal}.")
+                if count is not None and len(found) == count:
+                    return found, left_out
+            if count is None or not kinds:
+                break
+        if not found:
+            raise SpecError(f"no reactive scenario fits on '{self.name}': {' '.join(left_out)}")
+        return found, left_out
+
+    def _one(self, kind: Kind, seed: int) -> Scenario:
+        scenario_id = f"{kind}-{self.name}-{seed:03d}"
+        return reactive.build(kind, self.where, self.street_map, self.graph, seed, scenario_id)
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:

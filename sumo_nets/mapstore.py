@@ -6,8 +6,6 @@ import dataclasses
 import gzip
 import hashlib
 import re
-import shutil
-import tempfile
 from datetime import UTC, datetime
 from functools import cache
 from importlib.metadata import version
@@ -24,12 +22,16 @@ from sumo_nets.featurefile import NAME, read_features, with_features, write_feat
 from sumo_nets.importer import Options, convert
 from sumo_nets.netfacts import read_facts
 from sumo_nets.nethash import net_content_hash
+from sumo_nets.rawfile import head_of
+from sumo_nets.scratch import move_in, moving, scratch_in
 from sumo_nets.store import cache_folder
 
+ABOUT = "about.json"
 IMPORTER = 2
 """Version of the importer: another one for every change that changes an imported net."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
 """File names that name no place: the folder's name is taken instead."""
+NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
 GAME_LICENCE = "EPL-2.0 OR GPL-2.0-or-later, with Eclipse SUMO"
 
 
@@ -70,7 +72,7 @@ def import_map(source: Path, name: str | None = None, options: Options | None = 
     Raises MapError when the file makes no usable net, UsageError for an unusable name; then nothing is kept.
     """
     name = map_name(source) if name is None else name
-    if not re.fullmatch(r"[a-z0-9][a-z0-9._-]{0,63}", name):
+    if not NAMES.fullmatch(name):
         raise UsageError(f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters")
     if name in _game_nets() and source != _game_nets()[name]:
         raise UsageError(f"'{name}' is the name of a net that comes with SUMO: choose another with --name")
@@ -94,17 +96,28 @@ def map_net(place: CityMap | str) -> Path:
     """
     name = place if isinstance(place, str) else place.map
     path = maps_folder() / name / "net.xml"
-    if not path.exists():
+    if not NAMES.fullmatch(name) or not _is_there(path):
         games = _game_nets()
         if name not in games:
             raise unknown("map", name, known_maps())
-        _keep(games[name], name, Options())
+        _keep(games[name], name, Options(), in_place=False)
     if not isinstance(place, str) and place.net_hash and (found := map_hash(path)) != place.net_hash:
         raise MapError(
             f"map '{name}': its hash is {found}, but the scenario was made on {place.net_hash}: import the same "
             "file with the same options and versions again, or make the scenarios anew"
         )
     return path
+
+
+def _is_there(net: Path) -> bool:
+    if net.exists():
+        return True
+    try:
+        # It may be replaced at this very moment.
+        with moving(maps_folder()):
+            return net.exists()
+    except OSError:
+        return False
 
 
 def read_map(place: CityMap | str) -> StreetMap:
@@ -121,9 +134,16 @@ def map_hash(net: Path) -> str:
     return with_features(net_content_hash(net), net.with_name(NAME))
 
 
+def file_hash(path: Path) -> str:
+    """SHA-256 (16 hex digits) of a file's bytes. Raises MapError when it cannot be read."""
+    head_of(path)
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()[:16]
+
+
 def about_map(name: str) -> About:
     """Where an imported map comes from. Imports a SUMO-supplied one first."""
-    path = map_net(name).with_name("about.json")
+    path = map_net(name).with_name(ABOUT)
     try:
         return msgspec.json.decode(path.read_bytes(), type=About)
     except (OSError, msgspec.DecodeError, msgspec.ValidationError) as error:
@@ -139,20 +159,26 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
 def known_maps() -> dict[str, Known]:
     """Every place by name: imported ones, then nets with sidewalks that come with SUMO."""
     folder = maps_folder()
-    found = sorted(p.parent for p in folder.glob("*/about.json")) if folder.is_dir() else []
+    found = sorted(p.parent for p in folder.glob(f"*/{ABOUT}")) if folder.is_dir() else []
     games = _game_nets()
-    known = {p.name: Known(p.name, "imported", about_map(p.name).source) for p in found if p.name not in games}
+    known = {p.name: Known(p.name, "imported", _source_of(p.name)) for p in found if p.name not in games}
     return known | {name: Known(name, "sumo", path.name) for name, path in games.items()}
 
 
-def _keep(source: Path, name: str, options: Options) -> About:
+def _source_of(name: str) -> str:
+    try:
+        return about_map(name).source
+    except MapError:
+        return "damaged: import it again"
+
+
+def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -> About:
     """Convert in a scratch folder beside the finished maps, then move the whole into place."""
     folder = maps_folder()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".importing-", dir=folder) as scratch:
-            made = convert(source, Path(scratch), options)
-            ready = Path(scratch) / "ready"
+        with scratch_in(folder) as scratch:
+            made = convert(source, scratch, options)
+            ready = scratch / "ready"
             ready.mkdir()
             made.net.rename(ready / "net.xml")
             if made.features:
@@ -160,7 +186,7 @@ def _keep(source: Path, name: str, options: Options) -> About:
             about = About(
                 name=name,
                 source=source.name,
-                source_hash=hashlib.sha256(source.read_bytes()).hexdigest()[:16],
+                source_hash=file_hash(source),
                 format=" ".join(filter(None, (made.format, made.facts.version, made.packing))),
                 imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
                 bbox=options.bbox,
@@ -172,23 +198,11 @@ def _keep(source: Path, name: str, options: Options) -> About:
                 licences=_licences(source, made.licences),
                 net_hash=map_hash(ready / "net.xml"),
             )
-            (ready / "about.json").write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
-            _replace(ready, folder / name, Path(scratch))
+            (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
+            move_in(ready, folder / name, in_place=in_place)
             return about
     except OSError as error:
         raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
-
-
-def _replace(ready: Path, target: Path, scratch: Path) -> None:
-    if target.exists():
-        target.rename(scratch / "old")
-    try:
-        ready.rename(target)
-    except OSError:
-        # Another process was faster: its map is as good.
-        if not (target / "net.xml").exists():
-            raise
-        shutil.rmtree(ready)
 
 
 def _licences(source: Path, found: tuple[str, ...]) -> tuple[str, ...]:

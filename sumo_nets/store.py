@@ -83,7 +83,7 @@ def write_city(city: City, folder: Path) -> City:
     """
     known = {NET_NAME, ABOUT_NAME}
     try:
-        if folder.exists() and not {path.name for path in folder.iterdir()} <= known:
+        if folder.exists() and not {p.name for p in folder.iterdir() if not p.name.startswith(".building-")} <= known:
             raise MapError(f"{folder}: is not a city's folder, and not empty: choose a new one")
         net = folder / NET_NAME
         build_city(city, net)

@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO, Any
 
 import pytest
 
@@ -138,8 +139,12 @@ def test_a_file_that_may_not_be_read_is_refused(tmp_path: Path, monkeypatch: pyt
     source = tmp_path / "a.osm"
     source.write_text(TOWN)
 
-    def closed(self: Path, *_arguments: object) -> None:
-        raise PermissionError(13, "Permission denied", str(self))
+    opened = Path.open
+
+    def closed(self: Path, *arguments: Any, **more: Any) -> IO[Any]:
+        if self == source:
+            raise PermissionError(13, "Permission denied", str(self))
+        return opened(self, *arguments, **more)
 
     monkeypatch.setattr(Path, "open", closed)
     with pytest.raises(MapError, match=r"a\.osm: cannot be read: Permission denied"):
