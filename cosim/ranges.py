@@ -117,13 +117,8 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
             raise SpecError("; ".join(faults))
 
     def _out_of_range(self) -> list[str]:
-        faults = []
-        for field, rule in _rules(type(self)):
-            value = getattr(self, field)
-            # What is not given has no range to keep.
-            if value is not None and value is not msgspec.UNSET and (refusal := rule.refusal(field, value)):
-                faults.append(self.called + refusal)
-        return faults
+        told = (refusal_of(field, rule, getattr(self, field)) for field, rule in rules_of(type(self)))
+        return [self.called + refusal for refusal in told if refusal]
 
     @property
     def called(self) -> str:
@@ -133,6 +128,18 @@ class Ranged(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=Tr
     def contradictions(self) -> Iterator[str]:
         """What fields in their ranges may not be together, one message each; "" is none."""
         return iter(())
+
+
+@cache
+def rules_of(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
+    """The rules of a spec, field by field, in the order of the fields."""
+    hints = get_type_hints(kind, include_extras=True)
+    return tuple((name, rule) for name in kind.__struct_fields__ for rule in getattr(hints[name], "__metadata__", ()))
+
+
+def refusal_of(field: str, rule: Rule, value: Any) -> str:
+    """What a rule says of the value of a field; nothing where none is given."""
+    return "" if value is None or value is msgspec.UNSET else rule.refusal(field, value)
 
 
 def shown(value: object) -> str:
@@ -153,10 +160,3 @@ def _in_few_digits(value: float) -> float:
         return value if abs(value) < 10**18 else float(value)
     except OverflowError:
         return math.inf if value > 0 else -math.inf
-
-
-@cache
-def _rules(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
-    """The rules of a spec, field by field, in the order of the fields."""
-    hints = get_type_hints(kind, include_extras=True)
-    return tuple((name, rule) for name in kind.__struct_fields__ for rule in getattr(hints[name], "__metadata__", ()))

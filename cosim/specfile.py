@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from types import UnionType
@@ -13,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import msgspec
 
 from cosim.errors import SpecError
-from cosim.ranges import MOST_SHOWN, printable
+from cosim.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of
 
 MOST_BYTES: Final = 1_000_000_000
 MOST_TOLD: Final = 5
@@ -122,7 +123,9 @@ def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
     for fault in () if whole else _faults_below(tree, _bare(kind, tree), place):
         found = True
         yield fault
-    if not found:
+    if found:
+        yield from _out_of_range(tree, _bare(kind, tree), place)
+    else:
         yield f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at `{place}`{_choices(kind, tree)}"
 
 
@@ -149,6 +152,17 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
         for number, item in enumerate(tree):
             part = parts[0] if parts[-1] is Ellipsis else parts[number]
             yield from _faults_in(item, part, f"{place}[{number}]")
+
+
+def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
+    """The fields of a value that are out of their range; those of another type are told of already."""
+    if not (isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, Ranged)):
+        return
+    types = {field.name: field.type for field in msgspec.structs.fields(kind)}
+    for field, rule in rules_of(kind):
+        with suppress(*_REFUSED):
+            if field in tree and (refusal := refusal_of(field, rule, msgspec.convert(tree[field], types[field]))):
+                yield f"{refusal} - at `{place}`"
 
 
 def _bare(kind: Any, tree: Any) -> Any:

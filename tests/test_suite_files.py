@@ -123,16 +123,17 @@ def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
     """One on a line, the first five of many; wrong types, unknown fields and contradictions alike."""
     whole = sound()
     first, second, third = whole["scenarios"]
-    first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}}
+    first |= {"seed": "x", "gaol": 1, "crowd": {"persons": -1, "groups": 2.0}, "goal_radius_m": 1e9}
     second["goal"] = [0.0, 0.0]
     assert refusal(tmp_path / "s.json", json.dumps(whole)).splitlines() == [
-        "4 faults:",
+        "5 faults:",
         "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: " + ", ".join(
             sorted(first.keys() - {"gaol"}, key=list(msgspec.to_builtins(suite("reactive").scenarios[0])).index)
         ),
         "  Expected `int`, got `str` - at `$.scenarios[0].seed`",
         "  crowd persons must be in [0, 1000], not -1; crowd groups must be a share in [0, 1], not 2.0"
         " - at `$.scenarios[0].crowd`",
+        "  goal_radius_m must be in [0.1, 20], not 1000000000.0 - at `$.scenarios[0]`",
         f"  scenario '{second['id']}': goal (0.0, 0.0) is not the route's end "
         f"{tuple(second['route'][-1])} - at `$.scenarios[1]`",
     ]  # fmt: skip
