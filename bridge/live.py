@@ -39,7 +39,8 @@ def taken(payload: bytes, offer: Offer) -> Ack:
         decode = msgspec.json.decode if payload[:1] in _JSON_BEGINS else msgspec.msgpack.decode
         return offer(decode(payload, type=Injection))
     except (msgspec.DecodeError, RecursionError, ValueError, SpecError) as error:
-        return Ack(id="", status="refused", reason=str(error))
+        unknown = f". Valid choices: {', '.join(Injection.__struct_fields__)}" if "unknown field" in str(error) else ""
+        return Ack(id="", status="refused", reason=f"{error}{unknown}")
 
 
 def encoded(ack: Ack, *, as_json: bool) -> bytes:

@@ -28,6 +28,7 @@ from cosim.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, 
 app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
@@ -63,7 +64,7 @@ def common(
     "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
-    "`cosim run long-horizon --map bologna-acosta --seed 3 --episodes 5`  \n"
+    "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
     "`cosim run long-horizon --policy route --episodes 2 --counterfactual`"
 )
@@ -168,6 +169,7 @@ def run(
     with ExitStack() as stack:
         if on_air is not None:
             stack.enter_context(Session.hub(on_air.endpoint))
+            err.print(f"On the air at {on_air.endpoint}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
         held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
         stack.enter_context(held)
         for note in held.notes:
@@ -258,7 +260,9 @@ def show(
     if events:
         if episode is not None:
             raise UsageError("--events is about a whole run: leave --episode out")
-        print_sheet(out, folder)
+        from scenarios.eventsheet import sheet_of_run
+
+        print_sheet(out, sheet_of_run(folder))
         return
     if episode is None:
         table = table_of(records.values())

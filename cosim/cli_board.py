@@ -39,8 +39,10 @@ class Left:
     @property
     def share(self) -> float:
         """What of the run is done, 0 to 1."""
+        if not self._lengths_m:
+            return 1.0
         done_m = sum(SETUP_M + self._lengths_m[name] * share for name, share in self._shares.items())
-        return done_m / max(sum(SETUP_M + length_m for length_m in self._lengths_m.values()), SETUP_M)
+        return done_m / sum(SETUP_M + length_m for length_m in self._lengths_m.values())
 
     def seconds(self, since_s: float) -> float | None:
         """How long the rest takes, judged by the `since_s` seconds that the run took so far; None: too early to say."""

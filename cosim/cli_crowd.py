@@ -128,8 +128,12 @@ def compare_one(
         told = recorded(folder, episode)
         state_hash, found = compared(told, tell)
     check(folder, told, state_hash)
-    table = Table(episode, f"delay, s: within {NEAR_M:g} m", "of", "delay, s: all", "of", "not comparable")
+    table = Table(episode, "delay of\nthose near, s", "those\nnear", "delay of\nall, s", "all", "not\ncomparable")
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
         near, everybody = (f"{delay.near_s:+.1f}", str(delay.near)), (f"{delay.delay_s:+.1f}", str(delay.compared))
         table.add_row(name, *near, *everybody, str(delay.unmatched))
     out.print(table)
+    out.print(
+        f"delay: how much later than without the robot, summed; near: came within {NEAR_M:g} m of it; far from it the "
+        "two streets differ by chance; not comparable: not the same in both"
+    )

@@ -11,11 +11,12 @@ from rich.console import Console
 
 from cosim.cli_crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
 from cosim.cli_progress import doing
-from cosim.errors import UsageError, unknown
+from cosim.errors import MachineError, UsageError, unknown
 
 if TYPE_CHECKING:
     from scenarios.look import View
 
+PICTURES = (".png", ".jpg", ".jpeg")
 out = Console()
 err = Console(stderr=True)
 
@@ -43,8 +44,8 @@ def look(
     view: Annotated[str, typer.Option(help="robot, follow (from behind) or above.")] = "robot",
     size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
     suite: Annotated[
-        str, typer.Option(help="Where the scenario is: a suite or a suite's .json file.")
-    ] = "long-horizon",
+        str | None, typer.Option(help="Where the scenario is: a suite or a suite's .json file; by default looked up.")
+    ] = None,
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
     residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
     groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
@@ -54,13 +55,15 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import chosen, with_crowd
+    from scenarios.catalog import chosen, holding, with_crowd
     from scenarios.catalog import suite as shipped
     from scenarios.look import look
 
     picked = view_of(view)
     pixels = size_of(size)
-    whole = with_crowd(shipped(suite), residents=residents, groups=groups, elderly=elderly, children=children)
+    check_picture(output)
+    found = holding(scenario) if suite is None else shipped(suite)
+    whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
     (one,) = chosen(whole, [scenario])
     with doing("choosing the camera") as tell:
         image, time_s = look(one, policy, at, picked, pixels, camera_here(camera), tell)
@@ -113,8 +116,16 @@ def size_of(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
+def check_picture(path: Path) -> None:
+    """Before it is drawn: raises UsageError when no picture can have this name, MachineError without its folder."""
+    if path.suffix.lower() not in PICTURES:
+        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg")
+    if not path.resolve().parent.is_dir():
+        raise MachineError(f"{path}: cannot be written: no folder {path.parent}")
+
+
 def save(image: object, path: Path) -> None:
-    """Write a picture. Raises UsageError when it cannot be written there."""
+    """Write a picture. Raises MachineError when it cannot be written there."""
     import cv2
     import numpy as np
 
@@ -123,4 +134,4 @@ def save(image: object, path: Path) -> None:
     except cv2.error as error:
         raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg") from error
     if not written:
-        raise UsageError(f"{path}: the picture cannot be written there")
+        raise MachineError(f"{path}: the picture cannot be written there")

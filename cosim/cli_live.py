@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from contextlib import nullcontext, suppress
@@ -178,6 +179,7 @@ def _name(below: str) -> str:
 def checked_endpoint(endpoint: str, option: str) -> str:
     """An endpoint of an option, as zenoh writes it. Raises UsageError."""
     like = DEFAULT if option in ("--live", "--connect") else DIRECTOR
-    if not endpoint.startswith(("tcp/", "unixsock-stream/", "tls/", "udp/", "quic/")):
-        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS, like {like}")
+    over_ip = re.fullmatch(r"(?:tcp|tls|udp|quic)/[^/]+:(\d{1,5})(?:[?#].*)?", endpoint)
+    if not (over_ip and 1 <= int(over_ip.group(1)) <= 65535) and not re.fullmatch(r"unixsock-stream/.+", endpoint):
+        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
     return endpoint

@@ -30,7 +30,7 @@ out = Console()
     "import",
     epilog="Examples:  \n"
     "`cosim map import berlin.osm.pbf --bbox 13.43,52.46,13.45,52.48`  \n"
-    "`cosim map import hamburg.net.xml.gz --upgrade --name hamburg`",
+    "`cosim map import hamburg.net.xml.gz --upgrade`",
 )
 def import_(
     file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
@@ -95,7 +95,7 @@ def check(
 
 
 @map_app.command(
-    epilog="Examples:  \n`cosim map endure bologna`  \n`cosim map endure bologna wildau --minutes 30 --seed 1`"
+    epilog="Examples:  \n`cosim map endure sumo-drt`  \n`cosim map endure sumo-drt sumo-fkk-in --minutes 30 --seed 1`"
 )
 def endure(
     maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps, folders of cities or maps, nets.")],

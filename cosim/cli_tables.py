@@ -154,13 +154,13 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     out.print(f"n episodes; {named}: share of the event's episodes; nearest: least distance to a person's centre")
 
 
-def print_sheet(out: Console, folder: Path) -> None:
-    """What was measured of each event of a run, and two summaries by kind: made for 80 columns."""
-    from scenarios.eventsheet import sheet_of_run, summary
+def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
+    """What was measured of each event of a run (`scenarios.eventsheet`), and two summaries by kind: for 80 columns."""
+    from scenarios.eventsheet import summary
 
-    sheet = sheet_of_run(folder)
     heads = ("trigger\nm", "error\nm", "tick\nm", "speed\nm/s", "stated\nm/s", "left\nm", "angle\ndeg", "least\nm")
-    rows = Table(Column("episode", no_wrap=True), *(Column(head, justify="right") for head in heads), box=None)
+    columns = (Column(head, justify="right", no_wrap=True) for head in heads)
+    rows = Table(Column("episode", overflow="fold"), *columns, box=box.SIMPLE_HEAD, padding=0)
     for row in sheet.itertuples(index=False):
         name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
         numbers = (f"{value:.{digits}f}" for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True))

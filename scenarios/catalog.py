@@ -28,6 +28,17 @@ def suite(name: str) -> Suite:
     return read_suite(SUITES[name])
 
 
+def holding(scenario_id: str) -> Suite:
+    """The shipped suite with a scenario of this id. Raises UsageError with the valid names."""
+    ids: list[str] = []
+    for name in SUITES:
+        whole = suite(name)
+        if scenario_id in (here := [s.id for s in whole.scenarios]):
+            return whole
+        ids += here
+    raise unknown("scenario", scenario_id, ids)
+
+
 def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version says so.
 

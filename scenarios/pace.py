@@ -11,7 +11,7 @@ import os
 import platform
 import re
 import statistics
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -46,8 +46,6 @@ AT_LEAST: Final = (0.6, 1.5)
 """No estimate is narrower than this around its middle: a machine has other work, too, at times."""
 SHARED: Final = 1.4
 """More processes than were measured share caches and memory: one of them may take so much longer."""
-
-LONGER: Final = "; longer if it stands still or thinks long"
 
 
 class Measured(msgspec.Struct, frozen=True, kw_only=True):
@@ -101,29 +99,34 @@ def estimate(
     short = all(s.ends_on_failure for s in scenarios)
     alike = [m for m in known if m.renderer == renderer and m.compared == compared]
     same = [m for m in alike if (m.policy, m.short) == (policy, short)][-RECENT:]
-    if len(same) >= ENOUGH:
-        found = same
-        rates = _around([m.work_s / m.route_m for m in same])
-        basis = f"measured in {_episodes(len(same))} of '{policy}' on this machine"
-    elif len(found := alike[-RECENT:]) >= ENOUGH:
-        speed = _around([m.simulated_s / m.work_s for m in found])
-        rates = 1.0 / (DRIVES_MPS[1] * speed[1]), 1.0 / (DRIVES_MPS[0] * speed[0])
-        simulates = statistics.median(m.simulated_s / m.work_s for m in found)
-        basis = (
-            f"this machine simulates {simulates:.1f} s a second, the policy is taken to drive at {_to(DRIVES_MPS)} m/s"
-        )
-        basis += LONGER
-    else:
-        found, more = [], COMPARES if compared else 1.0
-        rates = 1.0 / (DRIVES_MPS[1] * SIMULATES[1]), more / (DRIVES_MPS[0] * SIMULATES[0])
-        basis = f"a guess, as nothing is measured on this machine yet{LONGER}"
-    setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
+    others = alike[-RECENT:] if len(alike) >= ENOUGH else []
+    found = same if len(same) >= ENOUGH else others
     slots = min(jobs, cores)
     slower = SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
+    setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
+
+    def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
+        fast, slow = ([setup + work for work in works] for setup, works in zip(setup_s, (low_s, high_s), strict=True))
+        return makespan(fast, slots), slower * makespan(slow, slots)
+
     lengths_m = [s.route_line.length_m for s in scenarios]
-    low_s = makespan([setup_s[0] + rates[0] * metres for metres in lengths_m], slots)
-    high_s = makespan([slower * (setup_s[1] + rates[1] * metres) for metres in lengths_m], slots)
-    return Estimate(low_s, high_s, basis)
+    if found is same:
+        rates = _around([m.work_s / m.route_m for m in same])
+        basis = f"measured in {_episodes(len(same))} of '{policy}' on this machine"
+        return Estimate(*taken_s(*([rate * metres for metres in lengths_m] for rate in rates)), basis)
+    if others:
+        slow, fast = _around([m.simulated_s / m.work_s for m in others])
+        middle = statistics.median(m.simulated_s / m.work_s for m in others)
+        driven = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s"
+        basis = f"this machine simulates {middle:.1f} s a second, {driven}"
+    else:
+        slow, fast = SIMULATES[0] / (COMPARES if compared else 1.0), SIMULATES[1]
+        basis = "a guess, as nothing is measured on this machine yet"
+    spans = ([metres / (v * speed) for metres in lengths_m] for v, speed in zip(DRIVES_MPS, (slow, fast), strict=True))
+    high_s, low_s = spans
+    stuck_s = taken_s([], [s.time_limit_s / slow for s in scenarios])[1]
+    basis += f"; up to {duration(stuck_s)} if it stands still, longer if it thinks long"
+    return Estimate(*taken_s(low_s, high_s), basis)
 
 
 def makespan(taken_s: Sequence[float], slots: int) -> float:
@@ -212,10 +215,6 @@ def _around(values: Sequence[float]) -> tuple[float, float]:
     """Between which two most values lie, and never narrower than AT_LEAST."""
     low, middle, high = np.quantile(values, [0.2, 0.5, 0.8])
     return float(min(low, AT_LEAST[0] * middle)), float(max(high, AT_LEAST[1] * middle))
-
-
-def _to(pair: tuple[float, float]) -> str:
-    return f"{pair[0]:g} to {pair[1]:g}"
 
 
 def _episodes(count: int) -> str:

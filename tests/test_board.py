@@ -77,6 +77,12 @@ def test_a_comparison_is_part_of_its_episode() -> None:
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 
 
+def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
+    """Resumed after its last episode: the bar is full."""
+    board, *_ = board_of(LONG[:1], done=(LONG[0].id,))
+    assert board.left.share == 1.0 and "1/1" in str(board.bars.tasks[0].fields["count"])
+
+
 def test_the_bars_fit_80_columns() -> None:
     """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is cut."""
     named = msgspec.structs.replace(LONG[7], id="ped_crossing-001")

@@ -151,12 +151,16 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("film", "run", "t-0", "--view", "inside"), "unknown view"),
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
+        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 172, among them"),
+        (("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"), "use a name that ends in .png or .jpg"),
+        (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],
 )
 def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, cosim: Cosim, words: tuple[str, ...], told: str) -> None:
     """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
     done = cosim(*words, cwd=desk)
     assert done.returncode == (3 if "written" in told else 2) and told in done.stderr and "Traceback" not in done.stderr
+    assert "starting" not in done.stderr or words[0] == "film"
 
 
 def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:

@@ -14,6 +14,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli import app
+from cosim.cli_live import checked_endpoint
+from cosim.errors import UsageError
 from tests.conftest import PATIENCE_S
 
 FIRST = ("run", "list", "show", "doctor")
@@ -59,6 +61,19 @@ def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
     assert not re.findall(r"<[a-z|-]*[|][a-z|-]*(?![a-z|>-])", "\n".join(lines))
 
 
+def test_h_is_help() -> None:
+    """Whoever types -h is helped, everywhere."""
+    assert said("-h") == said("--help") and said("map", "check", "-h") == said("map", "check", "--help")
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
+    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an example imports it."""
+    named = re.findall(r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or "")
+    imported = re.findall(r"map import ([\w-]+)[.]", COMMANDS["map", "import"].epilog)
+    assert all(name.startswith("sumo-") or name in imported for name in named), named
+
+
 def test_what_a_newcomer_needs_comes_first() -> None:
     """`cosim --help` begins with the commands of the README's first section."""
     shown = said("--help")
@@ -101,3 +116,18 @@ def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(mo
 
     monkeypatch.setattr(versions, "version", without)
     assert "PyBullet missing" in said("--version") and "SUMO 1.2" in said("--version")
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["7447", "tcp/", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:0", "tcp/:x", "ftp/a:1"]
+)
+def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) -> None:
+    """Before anything is tried: a protocol, an address, a port from 1 to 65535."""
+    with pytest.raises(UsageError, match=r"like tcp/127\.0\.0\.1:7447"):
+        checked_endpoint(endpoint, "--connect")
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "udp/host:65535", "unixsock-stream//tmp/a"])
+def test_an_endpoint_that_may_be_one_is_taken(endpoint: str) -> None:
+    """Names, addresses of both kinds, sockets in the file system."""
+    assert checked_endpoint(endpoint, "--connect") == endpoint

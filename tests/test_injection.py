@@ -105,7 +105,7 @@ def test_the_log_alone_replays_the_guests() -> None:
         (b'{"id":"a","path":[[10,500]]}', "not on this map"),
         (b'{"id":"a","path":[]}', "path"),
         (b'{"id":"a b","path":[[1,1]]}', "id"),
-        (b'{"id":"a","path":[[1,1]],"sped_mps":1}', "sped_mps"),
+        (b'{"id":"a","path":[[1,1]],"sped_mps":1}', "`sped_mps`. Valid choices: id, path, speed_mps, heading_rad"),
         (b'{"id":"a","path":[[1,1]],"stay_s":-1}', "stay_s must be 0"),
         (b'{"id":"a","path":[[1,NaN]]}', "malformed"),
         (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("nan")]]}), "no number"),

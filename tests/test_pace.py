@@ -10,6 +10,7 @@ import pytest
 from cosim.record import Record
 from cosim.runfolder import RunFolder, RunSpec
 from cosim.scenario import Scenario, Suite
+from cosim.telling import duration
 from cosim.versions import versions
 from scenarios import pace
 from scenarios.catalog import suite
@@ -55,7 +56,9 @@ def test_without_the_same_policy_the_machines_speed_counts_and_the_policy_is_sai
     assert nothing.high_s / nothing.low_s > others.high_s / others.low_s
     assert "simulates 6.0 s a second" in others.basis and "0.9 to 1.4 m/s" in others.basis
     assert nothing.basis.startswith("a guess, as nothing is measured on this machine yet")
-    assert "longer if it stands still" in others.basis and "longer if it stands still" in nothing.basis
+    most_s = sum(s.time_limit_s for s in LONG)
+    assert f"up to {duration(12 * 6.0 + most_s / 3.6)} if it stands still" in others.basis
+    assert "if it stands still" in nothing.basis and "longer if it thinks long" in nothing.basis
 
 
 def test_what_was_measured_otherwise_does_not_count() -> None:

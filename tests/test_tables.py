@@ -11,10 +11,11 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cosim.cli_tables import BY_KIND, COUNTS, LETTERS, SHOWN, print_by_kind, print_scenarios, print_table
+from cosim.cli_tables import BY_KIND, COUNTS, LETTERS, SHOWN, print_by_kind, print_scenarios, print_sheet, print_table
 from cosim.errors import unknown
 from cosim.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, suite
+from scenarios.eventsheet import COLUMNS
 
 
 def terminal() -> tuple[Console, io.StringIO]:
@@ -95,6 +96,16 @@ def test_the_table_by_kind_fits_80_columns() -> None:
     print_by_kind(out, table, kinds)
     assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
     assert re.search(r"^ ped_crossing +1 +0\.25 +0\.25\.\.0\.25 ", said.getvalue(), re.MULTILINE)
+
+
+def test_the_sheet_of_events_fits_80_columns() -> None:
+    """A long map's name and two digits before each point: numbers and headings are whole."""
+    row = ("sumo-fokr-bs-demo-003 12", "ped_crossing", -19.98, 0.123, 0.060, 1.65, 1.65, -12.34, -180.0, 12.34)
+    out, said = terminal()
+    print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
+    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
+    for word in ("trigger", "stated", "-19.98", "0.123", "-12.34", "-180", "12.34"):
+        assert word in said.getvalue()
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
