@@ -25,7 +25,7 @@ from cosim.state import Command, Signal
 
 HERE = Path(os.environ.get("HOSTILE_DESK", ".")).absolute()
 WALK = Command(1.0, 0.0)
-FLOOD_BYTES = 64 << 20
+FLOOD_BYTES = 16 << 20
 Act = Callable[["Hostile", Observation], object]
 ACTS: dict[str, Act] = {}
 RESETS: dict[str, Callable[[], None]] = {}

@@ -23,7 +23,7 @@ from tests.hostile import ACTS, FLOOD_BYTES, RESETS
 
 pytestmark = pytest.mark.engine
 
-ANSWER_S, START_S = 2.0, 5.0
+ANSWER_S, START_S = 4.0, 5.0
 DONE = ""
 """Nothing to say: the episode is done, and simulated as if the policy had done nothing."""
 
@@ -70,8 +70,8 @@ EXPECTED: dict[str, str] = {
     "closes-everything": "the environment process",
     "dies-and-leaves-processes": "the environment process ended with exit code 0 in the policy's act at 0.50 s",
     "kills-its-parent": "the environment process was killed by SIGKILL in the policy's act at 0.50 s, 2 times",
-    "hangs-with-the-lock": "policy 'hostile' gave no answer for 2 s in act at 0.50 s of hangs-with-the-lock",
-    "stops-itself": "gave no answer for 2 s in act at 0.50 s of stops-itself",
+    "hangs-with-the-lock": "policy 'hostile' gave no answer for 4 s in act at 0.50 s of hangs-with-the-lock",
+    "stops-itself": "gave no answer for 4 s in act at 0.50 s of stops-itself",
     "hangs-in-reset": "gave no answer for 5 s in reset of hangs-in-reset",
 }
 TWICE = {"dies-and-leaves-processes", "kills-its-parent", "closes-everything"}
@@ -180,7 +180,7 @@ def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
 def test_a_flood_of_text_leaves_small_logs(war: War) -> None:
     """Of what a policy prints the beginning and the end are kept."""
     logs = [path.read_bytes() for path in (war.folder / "logs").iterdir()]
-    assert max(map(len, logs)) < FLOOD_BYTES / 8
+    assert max(map(len, logs)) < FLOOD_BYTES / 2
     assert any(b"the flood begins" in log and b"bytes were printed here and left out" in log for log in logs)
     assert any(b"the flood ends" in log for log in logs)
 

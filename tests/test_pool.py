@@ -1,15 +1,24 @@
-"""Environment processes that cannot begin: the run's error in words, once, and not a crash of every episode."""
+"""Environment processes: those that cannot begin, die or say nothing, and what is told of them, once."""
 
 from __future__ import annotations
 
 import os
 import time
+from collections.abc import Iterator
+from multiprocessing import Pipe
 from pathlib import Path
 
 import pytest
 
 from cosim.driver import Doing
+from cosim.errors import MachineError
+from cosim.policies.load import load_policy
+from cosim.record import Record
+from cosim.runfolder import RunFolder, RunSpec, read_records
+from cosim.scenario import City, Scenario, Suite
+from scenarios import pool
 from scenarios.asked import Asked, Patience
+from scenarios.messages import Done, Hello, Job, Message, Ready
 from scenarios.shepherd import BoundedLog
 from tests.conftest import Cosim
 
@@ -45,7 +54,7 @@ class Edits(Mine):
 CANNOT_BEGIN = {
     "Exits": (2, "error: policy 'mine:Exits' cannot be made: SystemExit: no GPU left"),
     "Dies": (2, "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit code 7"),
-    "Hangs": (2, "error: policy 'mine' gave no answer for 3 s while it was loaded in an environment process"),
+    "Hangs": (2, "error: policy 'mine' gave no answer for 5 s while it was loaded in an environment process"),
     "Changes": (2, "error: policy 'mine:Changes' has another manifest in each process"),
     "Edits": (2, "error: policy 'mine:Edits' was edited while the run was going on: begin another run"),
 }
@@ -59,7 +68,7 @@ def desk(tmp_path: Path) -> Path:
 
 
 def run(cosim: Cosim, desk: Path, name: str) -> tuple[int, str]:
-    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", "3", "--out", "run")
+    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", "5", "--out", "run")
     said = cosim("run", "reactive", *words, cwd=desk)
     assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
     assert "crashed" not in said.stdout + said.stderr
@@ -129,3 +138,94 @@ def test_a_first_answer_may_take_longer(doing: Doing, answer_s: float, start_s: 
     asked.stops()
     assert asked.question is None
     asked.close()
+
+
+class Fake:
+    """An environment process that says what a test has prepared, and then nothing; or it ends."""
+
+    def __init__(self, *messages: Message, asks: Doing | None = None, ends: bool = False) -> None:
+        self.pipe, self.theirs = Pipe()
+        self.asked, self.question = Asked.new(), None
+        self.log = Path("worker-0.log")
+        self.killed = False
+        if asks is not None:
+            self.asked.starts(asks, 64)
+        self._messages: list[Message | None] = [*messages, *([None] if ends else [])]
+
+    def send(self, message: Hello | Job) -> None:
+        """It does not listen."""
+
+    def messages(self) -> Iterator[Message | None]:
+        while self._messages:
+            yield self._messages.pop(0)
+
+    def hang_up(self) -> None:
+        self.pipe.close()
+
+    def kill(self, *, wait: bool = True) -> None:
+        self.killed = True
+        self.question = self.asked.question
+
+    def end(self) -> str:
+        self.question = self.asked.question
+        return "the environment process ended with exit code 7"
+
+
+SCENARIO = Scenario(
+    id="s-0", suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+    route=((0.0, 0.0), (9.0, 0.0)),
+)  # fmt: skip
+
+
+def pooled(monkeypatch: pytest.MonkeyPatch, folder: Path, *fakes: Fake, **named: float) -> Record:
+    """The record of one scenario, run by these processes, one after the other."""
+    waiting = iter(fakes)
+    monkeypatch.setattr(pool, "Process", lambda log: next(waiting))
+    monkeypatch.setattr(pool, "POLL_S", 0.0)
+    suite, driver = Suite(name="s", version="1", scenarios=(SCENARIO,)), load_policy("stop")
+    spec = RunSpec(
+        suite="s", suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
+        scenarios=("s-0",), versions={},
+    )  # fmt: skip
+    with RunFolder.create(folder / "run", spec, suite) as held:
+        patience = Patience(**named)
+        pool.run_all(held, suite.scenarios, "stop", driver, jobs=1, tell=lambda _: None, patience=patience)
+        assert next(waiting, None) is None and held.finished() == {"s-0"}
+    (record,) = read_records(folder / "run")
+    return record
+
+
+def test_an_engine_that_hangs_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A process that says nothing, while its policy has nothing to answer, is killed; the second time it is a crash."""
+    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    fakes = (Fake(Ready()), Fake(Ready()))
+    record = pooled(monkeypatch, tmp_path, *fakes)
+    assert record.reason.startswith("the environment process showed no sign of life, 2 times") and record.ticks == 0
+    assert all(fake.killed for fake in fakes)
+
+
+def test_a_policy_that_hangs_is_not_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It is told once, with the policy, the time, and where."""
+    record = pooled(monkeypatch, tmp_path, Fake(Ready(), asks="act"), answer_s=0.0)
+    assert record.reason == "policy 'stop' gave no answer for 0 s in act at 3.20 s of s-0"
+
+
+def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """While a policy has time left to answer, its process may say nothing for as long as it likes."""
+    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    slow = Fake(Ready(), asks="act")
+    began = time.monotonic()
+    record = pooled(monkeypatch, tmp_path, slow, answer_s=0.2)
+    assert time.monotonic() - began > 0.2 and "gave no answer for 0.2 s" in record.reason
+
+
+def test_a_record_that_is_gone_is_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A process that reports an episode as done, of which there is no record, has not finished it."""
+    record = pooled(monkeypatch, tmp_path, Fake(Ready(), Done("s-0", "done")))
+    assert record.status == "crashed" and record.reason.startswith("its record was gone or damaged")
+
+
+def test_processes_that_never_come_up_end_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Twice in a row: the machine's fault, told with the log."""
+    with pytest.raises(MachineError, match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log"):
+        pooled(monkeypatch, tmp_path, Fake(ends=True), Fake(ends=True))

@@ -196,6 +196,22 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
         assert [r.scenario for r in read_records(path)] == ["s-1"]
 
 
+def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Path) -> None:
+    """Deleted or overwritten while it is in use: wrong from then on, and whole again after --resume."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.episode_folder("s-0").mkdir()
+        record("s-0").save(folder.episode_folder("s-0") / "record.json")
+        (tmp_path / "run/results.sqlite").write_bytes(b"no database" * 1000)
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
+            folder.adopt("s-0")
+        for path in (tmp_path / "run").glob("results.sqlite*"):
+            path.unlink()
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
+            folder.adopt("s-0")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        assert again.finished() == {"s-0"}
+
+
 def test_records_without_a_database_are_not_shown_as_nothing(tmp_path: Path) -> None:
     """`show` says the remedy."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
