@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import itertools
 import math
 import os
@@ -30,13 +29,9 @@ from physics.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within,
 from physics.world import BulletWorld
 from sumo_nets.netfile import read_net
 from sumo_nets.store import city_net
+from tests.tiny_street import tiny_map
 
-_spec = importlib.util.spec_from_file_location("tiles_of_tests", Path(__file__).with_name("test_tiles.py"))
-assert _spec is not None and _spec.loader is not None
-_tiles = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_tiles)
-
-BASE = _tiles.tiny_map()
+BASE = tiny_map()
 CLASSES = {"nw": "commercial", "ne": "residential", "sw": "boulevard", "se": "narrow"}
 MAP: StreetMap = dataclasses.replace(
     BASE,

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import math
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +17,9 @@ from cosim.state import LABELS, Command, Frame, Motion, People, RobotState, Sign
 from physics.camera import BulletCamera
 from physics.robots import ROBOTS, robot
 from physics.world import BulletWorld
+from tests.tiny_street import tiny_map
 
-_spec = importlib.util.spec_from_file_location("tiles_of_tests", Path(__file__).with_name("test_tiles.py"))
-assert _spec is not None and _spec.loader is not None
-_tiles = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_tiles)
-MAP = _tiles.tiny_map()
+MAP = tiny_map()
 
 EMPTY = Street(0)
 OPEN = Pose(-40.0, 100.0, 0.0)

@@ -298,10 +298,7 @@ def test_they_come_and_go_out_of_sight() -> None:
 
 def test_the_same_seed_lives_the_same_life_in_another_process() -> None:
     """Positions of every tick are the same bits, under another salt of Python's hashes; another seed differs."""
-    code = (
-        f"import importlib.util as u; s = u.spec_from_file_location('t', {__file__!r}); m = u.module_from_spec(s)\n"
-        "s.loader.exec_module(m); print(m.trace(7))"
-    )
+    code = "from tests.test_residents import trace; print(trace(7))"
     environment = os.environ | {"PYTHONHASHSEED": "321", "PYTHONPATH": str(Path(__file__).parents[1])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split()[-1] == trace(7) != trace(8)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,11 +20,7 @@ from physics.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, squar
 from sumo_nets.atlas import frozen, thawed
 from sumo_nets.elevation import steep_ports, steep_strips, surveyed
 from sumo_nets.profile import Course, Meeting, On, clamped, course, what_lies_there
-
-_spec = importlib.util.spec_from_file_location("tiles_of_tests", Path(__file__).with_name("test_tiles.py"))
-assert _spec is not None and _spec.loader is not None
-_tiles = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(_tiles)
+from tests.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float32))
 """One flat rise to the east, and a cell whose north-east corner is pulled up by 4 m."""
@@ -38,7 +32,7 @@ def hills(x0: float, y0: float, columns: int, rows: int) -> Terrain:
     return Terrain(x0, y0, 2.0, (20.0 + 1.5 * np.sin(x / 20.0) + 1.2 * np.cos(y / 17.0 + x / 40.0)).astype(np.float32))
 
 
-HILLY = dataclasses.replace(_tiles.tiny_map(), terrain=hills(-160.0, -160.0, 161, 161))
+HILLY = dataclasses.replace(tiny_map(), terrain=hills(-160.0, -160.0, 161, 161))
 
 
 def test_heights_by_hand() -> None:
@@ -128,7 +122,7 @@ def test_steps_stay_steep_and_leave_the_streets_alone() -> None:
     terrain, found = surveyed([straight([10, 10]), up, straight([20, 20], y_m=20.0)])
     assert terrain is not None and found is not None and found.clamped == 0
     assert along(terrain) == pytest.approx(10.0, abs=0.2) and along(terrain, y_m=20.0) == pytest.approx(20.0, abs=0.2)
-    strip = next(iter(_tiles.tiny_map().strips.values()))
+    strip = next(iter(tiny_map().strips.values()))
     stairs = dataclasses.replace(strip, id="stairs", line=np.array([[50.0, 1.0], [50.0, 19.0]]), width_m=2.0)
     street = dataclasses.replace(strip, id="street", line=np.array([[0.0, 0.0], [100.0, 0.0]]), width_m=2.0)
     assert steep_strips(terrain, (stairs, street)) == ("stairs",)
@@ -220,11 +214,11 @@ def test_tiles_on_hills_have_no_cracks_and_lie_on_the_land() -> None:
     assert terrain is not None
     for key in [(-1, -1), (0, 0), (0, -1)]:
         tile = build_tile(HILLY, key)
-        corners = np.concatenate([_tiles.triangles(tile, name) for name in tile.parts])
-        assert abs(_tiles.plan_areas(corners).sum() - 48.0**2) < 1e-6
-        _tiles.no_cracks(key, corners)
+        corners = np.concatenate([triangles(tile, name) for name in tile.parts])
+        assert abs(plan_areas(corners).sum() - 48.0**2) < 1e-6
+        no_cracks(key, corners)
         for name in ("road", "sidewalk"):
-            faces = _tiles.triangles(tile, name)
+            faces = triangles(tile, name)
             inside = faces[np.hypot(*(faces.mean(axis=1)[:, :2]).T) > 12.0].mean(axis=1)
             above = CURB_M if name == "sidewalk" else 0.0
             assert len(inside) and np.abs(inside[:, 2] - terrain.height(inside[:, :2]) - above).max() < 1e-3
@@ -243,7 +237,7 @@ def test_heights_on_hills_meet_at_tile_borders_and_follow_the_mesh() -> None:
 
 def test_ramps_rise_one_in_twelve_over_the_land() -> None:
     """Ahead of a crossing the ground is the land and the ramp's own rise, as on flat ground."""
-    flat, hilly = build_tile(_tiles.tiny_map(), key_at(0.0, 5.0)), build_tile(HILLY, key_at(0.0, 5.0))
+    flat, hilly = build_tile(tiny_map(), key_at(0.0, 5.0)), build_tile(HILLY, key_at(0.0, 5.0))
     assert HILLY.terrain is not None
     ahead = np.column_stack([np.zeros(60), np.linspace(3.51, 6.4, 60)])
     ramp = hilly.height(ahead) - HILLY.terrain.height(ahead)
@@ -255,14 +249,14 @@ def test_nothing_floats_on_a_hill() -> None:
     """Houses reach down to the lowest land around them, props to the lowest under them; doors are at the street."""
     ground, terrain = Ground(HILLY, 4), HILLY.terrain
     assert terrain is not None
-    houses = [b for key in _tiles.KEYS for b in ground.buildings(key)]
+    houses = [b for key in KEYS for b in ground.buildings(key)]
     assert len(houses) > 5
     for house in houses:
         around = shapely.get_coordinates(shapely.segmentize(house.polygon.exterior, 0.5))
         assert house.base_m <= terrain.height(around).min() + 0.05
         front = terrain.height(around[np.argsort(np.abs(around[:, 1]))[:3]])
         assert abs(front.mean() - house.floor_m) < 1.5
-    for key in _tiles.KEYS:
+    for key in KEYS:
         for prop, z in ground.props(key):
             assert z <= float(ground.heights([(prop.x_m, prop.y_m)])[0]) + 1e-9
     z, roll, pitch = ground.road([(20.0, 1.0)], [0.0], [(4.5, 1.8)])[0]
@@ -279,7 +273,7 @@ def test_a_snapshot_keeps_the_land() -> None:
     assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
     assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
     assert again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
-    flat = thawed(frozen(_tiles.tiny_map()))
+    flat = thawed(frozen(tiny_map()))
     assert flat.terrain is None and flat.elevation is None
 
 
@@ -287,7 +281,7 @@ def test_corners_too_steep_to_cross_are_closed() -> None:
     """Of three ports the one above the others is closed; on level land none is."""
     cliff = np.where(np.arange(40)[:, None] >= 22, 10.0, 0.0) * np.ones((1, 40))
     terrain = Terrain(-40.0, -40.0, 2.0, cliff.astype(np.float32))
-    strip = next(iter(_tiles.tiny_map().strips.values()))
+    strip = next(iter(tiny_map().strips.values()))
     ends = {"low1": [(-20.0, 0.0), (-5.0, 0.0)], "low2": [(20.0, 0.0), (5.0, 0.0)], "high": [(0.0, 6.0), (0.0, 20.0)]}
     strips = {n: dataclasses.replace(strip, id=n, line=np.array(line), width_m=2.0) for n, line in ends.items()}
     corner = Corner("w", shapely.box(-5, -2, 5, 6), (Port("low1", 1), Port("low2", 1), Port("high", 0)))
@@ -298,9 +292,9 @@ def test_corners_too_steep_to_cross_are_closed() -> None:
 
 def test_flat_ground_is_what_it_was() -> None:
     """Without terrain a tile is at height 0; a land of height 0 gives the same heights and leans."""
-    flat = Ground(_tiles.tiny_map(), 4)
+    flat = Ground(tiny_map(), 4)
     zero = Terrain(-200.0, -200.0, 2.0, np.zeros((200, 200), dtype=np.float32))
-    level = Ground(dataclasses.replace(_tiles.tiny_map(), terrain=zero), 4)
+    level = Ground(dataclasses.replace(tiny_map(), terrain=zero), 4)
     points = np.random.default_rng(2).uniform(-40.0, 40.0, (300, 2))
     assert flat.heights(points).tolist() == level.heights(points).tolist()
     pose = Pose(0.5, 4.0, 0.7)

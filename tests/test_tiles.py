@@ -8,97 +8,38 @@ import numpy as np
 import pytest
 import shapely
 
-from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
 from physics.buildings import Frontage
 from physics.frontage import frontage_in
 from physics.paint import paint_in
 from physics.tiles import CURB_M, TILE_M, Key, Tile, build_tile, distance_to, key_at, keys_within, square
-
-
-def tiny_map() -> StreetMap:
-    """A street along x with sidewalks on both sides, one crossing at x = 0, and a verge on the south side."""
-
-    def strip(name: str, x0: float, x1: float, y0: float, y1: float, corner: str, end: int, side: int) -> Strip:
-        line = np.array([[x0, (y0 + y1) / 2], [x1, (y0 + y1) / 2]])
-        corners = (None, corner) if end else (corner, None)
-        polygon = shapely.box(x0, y0, x1, y1)
-        return Strip(name, "sidewalk", line, y1 - y0, polygon, corners, frontage_m=2.0, road_side=side)
-
-    strips = [
-        strip("nw", -80, -2, 3.5, 6.5, "n", 1, -1),
-        strip("ne", 2, 80, 3.5, 6.5, "n", 0, -1),
-        strip("sw", -80, -2, -8, -5, "s", 1, 1),
-        strip("se", 2, 80, -8, -5, "s", 0, 1),
-        Strip(":c0", "crossing", np.array([[0, -3.5], [0, 3.5]]), 3.2, shapely.box(-1.6, -3.5, 1.6, 3.5), ("s", "n")),
-    ]
-    corners = [
-        Corner("n", shapely.box(-2, 3.5, 2, 6.5), (Port("nw", 1), Port("ne", 0), Port(":c0", 1))),
-        Corner("s", shapely.box(-2, -8, 2, -3.5), (Port("sw", 1), Port("se", 0), Port(":c0", 0))),
-    ]
-    lanes = [
-        Lane("e_1", "e", "road", np.array([[-80, -1.75], [80, -1.75]]), 3.5, shapely.box(-80, -3.5, 80, 0)),
-        Lane("-e_1", "-e", "road", np.array([[80, 1.75], [-80, 1.75]]), 3.5, shapely.box(-80, 0, 80, 3.5)),
-        Lane("e_0", "e", "verge", np.array([[-80, -4.25], [-2, -4.25]]), 1.5, shapely.box(-80, -5, -2, -3.5)),
-        Lane("f_0", "f", "verge", np.array([[2, -4.25], [80, -4.25]]), 1.5, shapely.box(2, -5, 80, -3.5)),
-    ]
-    return StreetMap(
-        "tiny",
-        (-80, -40, 80, 40),
-        {s.id: s for s in strips},
-        {c.id: c for c in corners},
-        {lane.id: lane for lane in lanes},
-        {},
-    )
-
+from tests.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 MAP = tiny_map()
-KEYS = keys_within(0.0, 0.0, 60.0)
-TILES = {key: build_tile(MAP, key) for key in KEYS}
 
 
-def triangles(tile: Tile, name: str) -> np.ndarray:
-    """(T, 3, 3) corners of one kind of ground."""
-    mesh = tile.parts[name]
-    return mesh.vertices[mesh.triangles]
+@pytest.fixture(scope="module")
+def tiles() -> dict[Key, Tile]:
+    """The tiles around the crossing."""
+    return {key: build_tile(MAP, key) for key in KEYS}
 
 
-def plan_areas(corners: np.ndarray) -> np.ndarray:
-    """(T,) signed areas seen from above."""
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    return 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0])
-
-
-def test_a_tile_is_covered_once() -> None:
+def test_a_tile_is_covered_once(tiles: dict[Key, Tile]) -> None:
     """The triangles of every tile, seen from above, fill its square exactly and none looks down."""
-    for tile in TILES.values():
+    for tile in tiles.values():
         areas = np.concatenate([plan_areas(triangles(tile, name)) for name in tile.parts])
         assert areas.min() > -1e-9
         assert abs(areas.sum() - TILE_M**2) < 1e-6
 
 
-def no_cracks(key: Key, corners: np.ndarray) -> None:
-    """Every edge off the border of a tile of (N, 3, 3) triangles is shared by two of them."""
-    edges: dict[frozenset[tuple[int, ...]], int] = {}
-    for triangle in np.rint(corners * 1e3).astype(int).tolist():
-        for a, b in zip(triangle, triangle[1:] + triangle[:1], strict=True):
-            edge = frozenset((tuple(a), tuple(b)))
-            edges[edge] = edges.get(edge, 0) + 1
-    x0, y0, x1, y1 = (round(1e3 * c) for c in square(key))
-    for edge, count in edges.items():
-        xs, ys = {p[0] for p in edge}, {p[1] for p in edge}
-        on_border = xs in ({x0}, {x1}) or ys in ({y0}, {y1}) or len(edge) == 1 or (len(xs) == len(ys) == 1)
-        assert count == 2 or on_border, (key, edge, count)
-
-
-def test_neighbouring_triangles_share_their_corners() -> None:
+def test_neighbouring_triangles_share_their_corners(tiles: dict[Key, Tile]) -> None:
     """Within a tile every edge off the border is shared by two triangles, walls and their feet included."""
-    for key, tile in TILES.items():
+    for key, tile in tiles.items():
         no_cracks(key, np.concatenate([triangles(tile, name) for name in tile.parts]))
 
 
-def test_heights_meet_at_tile_borders() -> None:
+def test_heights_meet_at_tile_borders(tiles: dict[Key, Tile]) -> None:
     """Two tiles agree on the height of points on their common border, on the ramps too."""
-    left, right = TILES[(-1, -1)], TILES[(0, -1)]
+    left, right = tiles[(-1, -1)], tiles[(0, -1)]
     x = square((0, -1))[0]
     border = np.column_stack([np.full(400, x), np.linspace(-20.0, -1e-3, 400)])
     assert np.allclose(left.height(border), right.height(border), atol=1e-9)
@@ -113,7 +54,7 @@ def test_the_curb_ramp_rises_one_in_twelve() -> None:
     assert np.allclose(mesh.vertices[:, 2], tile.height(mesh.vertices[:, :2] + [0.0, 1e-9]), atol=1e-6)
 
 
-def test_the_kinds_of_ground_lie_where_the_map_says() -> None:
+def test_the_kinds_of_ground_lie_where_the_map_says(tiles: dict[Key, Tile]) -> None:
     """Triangles' middles: sidewalk on strips, stripes on the crossing, road on lanes, verge on the verge."""
     where = {
         "road": shapely.box(-80, -3.5, 80, 3.5),
@@ -122,7 +63,7 @@ def test_the_kinds_of_ground_lie_where_the_map_says() -> None:
         "sidewalk": shapely.box(-80, -8, 80, 6.5),
         "verge": shapely.box(-80, -5, 80, -3.5),
     }
-    for tile in TILES.values():
+    for tile in tiles.values():
         for name, area in where.items():
             if name in tile.parts:
                 middle = triangles(tile, name).mean(axis=1)
@@ -130,10 +71,10 @@ def test_the_kinds_of_ground_lie_where_the_map_says() -> None:
                 assert np.allclose(triangles(tile, name)[..., 2] <= CURB_M + 1e-9, True)
 
 
-def test_tiles_do_not_depend_on_the_order() -> None:
+def test_tiles_do_not_depend_on_the_order(tiles: dict[Key, Tile]) -> None:
     """A tile built alone equals the same tile built after others."""
     again = build_tile(tiny_map(), (0, -1))
-    for name, mesh in TILES[(0, -1)].parts.items():
+    for name, mesh in tiles[(0, -1)].parts.items():
         assert np.array_equal(mesh.vertices, again.parts[name].vertices)
         assert np.array_equal(mesh.triangles, again.parts[name].triangles)
 
@@ -220,7 +161,7 @@ def test_domes_lie_in_the_triangles_of_the_ground() -> None:
     )
 
 
-def test_the_frontage_is_paved_where_there_are_shops() -> None:
+def test_the_frontage_is_paved_where_there_are_shops(tiles: dict[Key, Tile]) -> None:
     """Before shops it is covered from the sidewalk to the houses, without holes or doubles, a little above the ground,
     with a rim down to it where it ends; a home's driveway reaches from its sidewalk to the houses; the ground itself
     stays what it was."""
@@ -232,7 +173,7 @@ def test_the_frontage_is_paved_where_there_are_shops() -> None:
     covered, layers, rims = [], set(), []
     for key in KEYS:
         tile = build_tile(street_map, key)
-        assert set(tile.parts) - {"ramp"} == set(TILES[key].parts) - {"ramp"}
+        assert set(tile.parts) - {"ramp"} == set(tiles[key].parts) - {"ramp"}
         for mesh, cover in frontage_in(street_map, tile, 3):
             layers.add(cover.layer)
             above = mesh.vertices[:, 2] - tile.height(mesh.vertices[:, :2])
