@@ -20,7 +20,7 @@ run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy route --episodes 2 --jobs $(JOBS)
 
 test: .venv/dev.stamp | machine
-	@$(BIN)/python -m pytest -m "not engine"
+	@$(BIN)/python -m pytest -m "not engine" -n $(JOBS) --dist loadfile
 	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
 
 check: .venv/dev.stamp | machine
