@@ -111,9 +111,12 @@ def bench_cameras(rounds: int) -> None:
         values = [a / b for a, b in zip(found[above].fps, found[below].fps, strict=False)]
         ratios.add_row(name, *(spread(values) if values else NONE), target)
     out.print(ratios)
-    out.print(f"{drawn_by}; {rounds} rounds, medians", highlight=False)
-    wrong = {name: one.why for name, one in found.items() if one.why}
-    for name, why in wrong.items():
-        out.print(f"{name} cannot be drawn here: {why}", soft_wrap=True, markup=False, highlight=False)
+    out.print(f"{drawn_by}; {rounds} {'round' if rounds == 1 else 'rounds'}, medians", highlight=False)
+    wrong: dict[str, list[str]] = {}
+    for name, one in found.items():
+        if one.why:
+            wrong.setdefault(one.why, []).append(name)
+    for why, names in wrong.items():
+        out.print(f"{'; '.join(names)} cannot be drawn here: {why}", soft_wrap=True, markup=False, highlight=False)
     if wrong:
         out.print("What the machine lacks, and how to get it: `cosim doctor`.", highlight=False)

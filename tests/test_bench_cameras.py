@@ -25,10 +25,11 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
         Figure("by gl", partial(whole_frame, "gl", 3, 2), 200.0),
         Figure("by a package", partial(importlib.import_module, "nowhere"), ""),  # type: ignore[arg-type]
         Figure("by who dies", os._exit, 3),
+        Figure("by gl again", partial(whole_frame, "gl", 3, 2), 200.0),
         Figure("by bullet", partial(whole_frame, "bullet", 3, 2), 200.0),
     )
     found = measure(2, lambda _: None, figures)
-    assert [len(found[figure.name].fps) for figure in figures] == [0, 0, 0, 2]
+    assert [len(found[figure.name].fps) for figure in figures] == [0, 0, 0, 0, 2]
     assert "apt-get install libegl1" in found["by gl"].why and "OpenGL 4.3" in found["by gl"].why
     assert found["by a package"].why == "ModuleNotFoundError: No module named 'nowhere'"
     assert "process" in found["by who dies"].why and "exit code 3" in found["by who dies"].why
@@ -40,4 +41,5 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
     assert said.returncode == 0, said.stderr
     told = " ".join(said.stdout.split())
     assert "by a package cannot be drawn here: ModuleNotFoundError: No module named 'nowhere'" in told
+    assert "by gl; by gl again cannot be drawn here: the gl camera" in told and told.count("apt-get") == 1
     assert "`cosim doctor`" in told and "see below" in told
