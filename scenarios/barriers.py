@@ -120,18 +120,23 @@ def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon
 
 
 def prove_single_path(
-    street_map: StreetMap, route: Polyline, barriers: Sequence[Barrier], way: Sequence[Port], half_width_m: float
+    street_map: StreetMap,
+    route: Polyline,
+    barriers: Sequence[Barrier],
+    way: Sequence[Port],
+    half_width_m: float,
+    ground: tuple[shapely.Geometry, Polygon | MultiPolygon] | None = None,
 ) -> Polygon:
     """The area that can be reached from the start, once exactly one path leads to the goal. SpecError otherwise.
 
     What is shown, on the walkable polygon itself: (1) the part of walkable-minus-barriers that holds the start holds
     the goal; (2) it ends within REACH_M of the way, so nothing leads elsewhere; (3) it has no hole, and in an area
     without holes all paths between two points are the same but for bending; (4) start and goal stay connected when
-    the area is eroded by half the robot's width, so the robot fits through.
+    the area is eroded by half the robot's width, so the robot fits through. ground: what `ground_around` gives, where
+    it is known.
     """
-    strips = union_closed([street_map.strips[port.strip].polygon for port in way])
-    surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), REACH_M)
-    free = fenced(street_map.walkable_near(surroundings), barriers)
+    surroundings, walkable = ground_around(street_map, route, way) if ground is None else ground
+    free = fenced(walkable, barriers)
     start, goal = Point(route.points[0]), Point(route.points[-1])
     part = _part_with(free, start)
     if part is None or not part.covers(goal):
@@ -148,6 +153,15 @@ def prove_single_path(
     if not passable.covers(LineString(route.points)):
         raise SpecError(f"the route comes nearer than {half_width_m:.2f} m to the edge of the walkable area")
     return part
+
+
+def ground_around(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port]
+) -> tuple[shapely.Geometry, Polygon | MultiPolygon]:
+    """The area within REACH_M of a way, and the walkable ground there."""
+    strips = union_closed([street_map.strips[port.strip].polygon for port in way])
+    surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), REACH_M)
+    return surroundings, street_map.walkable_near(surroundings)
 
 
 def _part_with(area: Polygon | MultiPolygon, point: Point) -> Polygon | None:

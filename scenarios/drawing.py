@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import msgspec
+import shapely
 
 from cosim.errors import CosimError, SpecError
 from cosim.geometry import Polyline
@@ -29,16 +30,31 @@ class Refusals:
     def __str__(self) -> str:
         return "; ".join(f"{reason} ({n} times)" for reason, n in self._counts.most_common())
 
+    @property
+    def most_frequent(self) -> str:
+        """The reason given most often, "" without any."""
+        return self._counts.most_common(1)[0][0] if self._counts else ""
+
 
 def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
     """The first of TRIES draws that is not refused. Raises SpecError, `failure` and how often each reason was given."""
     refusals = Refusals()
-    for _ in range(TRIES):
+    found = first_of((draw for _ in range(TRIES)), refusals)
+    if found is None:
+        raise SpecError(f"{failure} in {TRIES} draws: {refusals}")
+    return found
+
+
+def first_of(draws: Iterable[Callable[[], Scenario]], refusals: Refusals) -> Scenario | None:
+    """The first scenario that is not refused, None when all are; refusals are counted."""
+    for draw in draws:
         try:
             return draw()
         except CosimError as refusal:
             refusals.add(refusal)
-    raise SpecError(f"{failure} in {TRIES} draws: {refusals}")
+        except shapely.errors.GEOSException as error:
+            refusals.add(SpecError(f"the ground is too tangled: {error}"))
+    return None
 
 
 def along(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 
 import msgspec
 import numpy as np
@@ -12,12 +12,14 @@ from shapely.geometry import LineString
 from cosim.errors import MapError, SpecError
 from cosim.events import Event, Kind
 from cosim.geometry import Polyline
+from cosim.mapcheck import on_road_shares
 from cosim.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from cosim.streetmap import Lane, Port, StreetMap, Strip
 from cosim.walks import WalkGraph
 from cosim.wayline import way_line
-from scenarios.barriers import barrier_at, branches, prove_single_path
-from scenarios.drawing import along, first_that_fits
+from scenarios.barriers import barrier_at, branches, ground_around, prove_single_path
+from scenarios.drawing import TRIES, Refusals, along, first_of
+from scenarios.hems import hem
 
 SHORTEST_M = 120.0
 LONGEST_M = 560.0
@@ -37,12 +39,26 @@ EVENT_KINDS: tuple[Kind, ...] = ("obstructing", "frontal")
 EVENT_WALKWAY_M = 3.0
 """Events take place on sidewalks at least this wide: there is room to pass."""
 
+SEARCHES = 150
+"""So many ways are searched for where no draw fits."""
+AVOIDED_SHARE = 0.3
+"""Sidewalks with more of their area on roads are not searched."""
+REMEDIES = {
+    "no way of the drawn length": "the walkable pieces are too small or have too few crossings: import a larger area",
+    "every long sidewalk": "import another area, or a net with sidewalks beside its roads",
+    "the way lies on a road": "its sidewalks are drawn on the carriageway: see `cosim map check MAP -o map.png`",
+    "the way would need": "its sidewalks lie over one another: see `cosim map check MAP -o map.png`; import a part",
+    "": "see `cosim map check MAP -o map.png` for narrow, torn or stacked sidewalks; another --seed or a part may do",
+}
+"""What would help, by how the most frequent reason begins."""
+
 EVENT_STRAIGHT_M = 24.0
 EVENT_BEND_M = 0.4
 
 
 def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
-    """A scenario drawn from `seed`. Raises SpecError when none of many draws has exactly one path to the goal."""
+    """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are searched for that can be
+    fenced in all along. Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = sorted(
         strip_id
@@ -52,10 +68,16 @@ def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scen
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")
-    return first_that_fits(
-        lambda: _draw(place, street_map, graph, rng, candidates, seed, scenario_id),
-        f"no long-horizon route on '{street_map.name}' with seed {seed}",
-    )
+    drawn, searched = Refusals(), Refusals()
+    draws = (lambda: _draw(place, street_map, graph, rng, candidates, seed, scenario_id) for _ in range(TRIES))
+    search = _search(place, street_map, graph, candidates, seed, scenario_id)
+    found = first_of(draws, drawn) or first_of(search, searched)
+    if found is None:
+        reason = searched.most_frequent
+        remedy = next((words for start, words in REMEDIES.items() if reason.startswith(start)), REMEDIES[""])
+        failure = f"no long-horizon route on '{street_map.name}' with seed {seed} in {TRIES} draws ({drawn})"
+        raise SpecError(f"{failure}, and none was found by searching ({searched}): {remedy}")
+    return found
 
 
 def _draw(
@@ -68,13 +90,27 @@ def _draw(
     scenario_id: str,
 ) -> Scenario:
     way, start_m, goal_m = draw_way(street_map, graph, rng, candidates)
-    route = Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 3))
+    return _along(place, street_map, rng, way, (start_m, goal_m), _barriers, seed, scenario_id)
+
+
+def _along(
+    place: Place,
+    street_map: StreetMap,
+    rng: np.random.Generator,
+    way: Sequence[Port],
+    ends_m: tuple[float, float],
+    fences: Callable[[StreetMap, Polyline, Sequence[Port]], tuple[Barrier, ...]],
+    seed: int,
+    scenario_id: str,
+) -> Scenario:
+    """The scenario along a way. Raises SpecError when the way does not do."""
+    route = Polyline(np.round(way_line(street_map, way, *ends_m).points, 3))
     if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
-    barriers = _barriers(street_map, route, way)
+    barriers = fences(street_map, route, way)
     bare = along(
         route,
         crossings,
@@ -89,15 +125,44 @@ def _draw(
     return msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
 
 
+def _search(
+    place: Place, street_map: StreetMap, graph: WalkGraph, candidates: Sequence[str], seed: int, scenario_id: str
+) -> Iterator[Callable[[], Scenario]]:
+    """More draws: of ways that keep off roads, stairs and bridges, fenced in all along where need be."""
+    rng = np.random.default_rng([seed, place.seed, 0x10E6, 1])
+    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
+    shares = dict(zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True))
+    avoided = {s.id for s in street_map.strips.values() if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE}
+    usable = [strip for strip in candidates if strip not in avoided]
+
+    def draw() -> Scenario:
+        if not usable:
+            raise SpecError("every long sidewalk is a stair, a bridge, a tunnel or on a road")
+        way, start_m, goal_m = search_way(street_map, graph, rng, usable, avoided)
+        return _along(place, street_map, rng, way, (start_m, goal_m), _hemmed, seed, scenario_id)
+
+    return (draw for _ in range(SEARCHES if usable else 1))
+
+
+def _hemmed(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+    """Barriers at the branches where they do, else all along the way. Raises SpecError when neither leave one path."""
+    try:
+        return _barriers(street_map, route, way)
+    except SpecError:
+        fences = hem(street_map, way)
+        prove_single_path(street_map, route, fences, way, HALF_WIDTH_M)
+        return fences
+
+
 def _barriers(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
     """Barriers that leave one path, square to their strips if possible. Raises SpecError when there are none."""
-    ports = branches(street_map, way)
+    ports, ground = branches(street_map, way), ground_around(street_map, route, way)
     barriers = tuple(barrier_at(street_map, port) for port in ports)
     try:
-        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M, ground)
     except SpecError:
         barriers = tuple(barrier_at(street_map, port, slanting=True) for port in ports)
-        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M)
+        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M, ground)
     return barriers
 
 
@@ -125,6 +190,28 @@ def draw_way(
         raise SpecError("the way crosses too few streets")
     goal_strip = street_map.strips[goal.strip]
     return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
+
+
+def search_way(
+    street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str], avoided: Set[str]
+) -> tuple[list[Port], float, float]:
+    """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that does."""
+    target_m = rng.uniform(SHORTEST_M, LONGEST_M)
+    strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
+    leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
+    start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
+    closed = street_map.too_steep | {leave.other} | {port for s in avoided for port in (Port(s, 0), Port(s, 1))}
+    reach = graph.reach(leave, closed, limit_m=target_m + 60.0)
+    ends = set(candidates)
+    goals = [port for port in reach.within(target_m - start_m - 60.0, target_m - start_m) if port.strip in ends]
+    for i in rng.permutation(len(goals)):
+        way = reach.path(goals[i])
+        if way is None or len({port.strip for port in way}) * 2 != len(way) + 2:
+            continue
+        crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
+        if crossed >= max(1, round(target_m / CROSSING_EVERY_M)):
+            return way, start_m, float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m
+    raise SpecError("no way of the drawn length crosses a street every 160 m")
 
 
 def route_crossings(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[RouteCrossing, ...]:

@@ -267,8 +267,11 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
     assert build(where, street_map, WalkGraph(street_map), 0, "plain").crossings
     steps = {name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()}
     street_map = dataclasses.replace(street_map, strips=steps)
-    with pytest.raises(SpecError, match="stairs, a bridge or a tunnel"):
+    with pytest.raises(SpecError) as caught:
         build(where, street_map, WalkGraph(street_map), 0, "stairs")
+    said = str(caught.value)
+    assert "the way leads over stairs, a bridge or a tunnel (" in said and "\n" not in said
+    assert "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import another area" in said
 
 
 @pytest.mark.parametrize("name", POLICIES)
