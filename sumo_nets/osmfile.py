@@ -189,7 +189,7 @@ def scanned(file: MapFile, elements: Elements) -> None:
     try:
         parse(parser, file.path)
     except ValueError as error:
-        raise MapError(f"{file.source}: broken OpenStreetMap file: {error}: get it again") from error
+        raise MapError(f"{file.source}: broken OpenStreetMap file: {error}") from error
 
 
 def osm_facts(file: MapFile) -> OsmFacts:
