@@ -357,7 +357,7 @@ KEYS = st.sampled_from(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=100)
 @given(data=st.data())
 def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     """Any tags, outlines, members and missing nodes: no exception, only finite things of sound height and outline."""

@@ -124,7 +124,8 @@ def test_the_picture_marks_problems() -> None:
     street_map = town()
     check = check_map(street_map)
     image = draw_map(street_map, check)
-    colours = {tuple(c) for c in np.unique(image.reshape(-1, 3), axis=0).tolist()}
+    numbers = np.unique(image.reshape(-1, 3).astype(int) @ (1 << 16, 1 << 8, 1))
+    colours = {(n >> 16, n >> 8 & 255, n & 255) for n in numbers.tolist()}
     assert {MARKS[kind][0] for kind in ("narrow", "on_road", "stacked")} <= colours and SIGNAL in colours
     assert {p.kind for p in check.problems} <= set(MARKS)
     part = draw_map(street_map, check, (190.0, -10.0, 210.0, 20.0))

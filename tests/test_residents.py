@@ -209,10 +209,16 @@ def test_where_no_shelter_stands_nobody_waits_for_a_bus() -> None:
     assert {s.thing.rpartition("/")[0] for s in one.graph.spots if s.what == "stop"} <= shelters
 
 
-def test_a_resident_walks_idles_and_does_something() -> None:
+@pytest.fixture(scope="module")
+def three_minutes() -> list[Moment]:
+    """Of residents of the first city, around a slow robot."""
+    return lived(town(*CITIES[0]), 180.0, v_mps=0.2)
+
+
+def test_a_resident_walks_idles_and_does_something(three_minutes: list[Moment]) -> None:
     """In three minutes all three states are seen; speeds and stays are those of the table, and who sits faces right."""
     one = town(*CITIES[0])
-    moments = lived(one, 180.0, v_mps=0.2)
+    moments = three_minutes
     states = {(r.number, r.phase) for m in moments for r in m.residents}
     assert {phase for _, phase in states} == {"walking", "idle", "interacting"}
     assert sum(len({p for n, p in states if n == number}) >= 2 for number in {n for n, _ in states}) >= 4
@@ -226,11 +232,11 @@ def test_a_resident_walks_idles_and_does_something() -> None:
                 assert (one_of.x_m, one_of.y_m) == (spot.x_m, spot.y_m)
 
 
-def test_speeds_are_those_of_the_motion() -> None:
+def test_speeds_are_those_of_the_motion(three_minutes: list[Moment]) -> None:
     """In three minutes nobody's speed differs from what it moved in the tick, also of who treads to turn or to rise."""
     before: dict[str, Floats] = {}
     treads = 0
-    for moment in lived(town(*CITIES[0]), 180.0, v_mps=0.2):
+    for moment in three_minutes:
         people = moment.people
         here = dict(zip(people.ids, people.xy, strict=True))
         for name, speed, pace in zip(people.ids, people.speed, people.pace, strict=True):
