@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
+import pandas as pd
 import pytest
 
 from cosim.scenario import City, CrowdSpec, Scenario, Suite, write_suite
@@ -162,6 +163,10 @@ def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
     """A row for every episode, exit code 1, no traceback."""
     assert war.said.returncode == 1 and "Traceback" not in war.said.stderr, war.said.stderr
     assert f"scheduled {len(EXPECTED)}, finished {len(EXPECTED)}" in war.said.stdout
+    assert "crashed error" in war.said.stdout and EXPECTED["error"] in war.said.stdout
+    table = pd.read_csv(war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""])
+    assert list(table.index) == sorted(EXPECTED)
+    assert set(table["success"][table["status"] == "crashed"]) == {0.0}
 
 
 def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
