@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import msgspec
 
-from cosim.errors import EngineError
+from cosim.core.errors import EngineError
 
 T = TypeVar("T", bound=msgspec.Struct)
 

@@ -1,6 +1,6 @@
 """The director of the event pedestrians, at either end of a Zenoh session.
 
-Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see `cosim.events`), so a
+Lockstep pull: at every tick the simulator asks and waits. The director keeps no state (see `cosim.spec.events`), so a
 query may be repeated and a director killed and started again without changing the episode.
 
 Both ends sign what they say with the version of their behaviours: a director that would do something else is refused,
@@ -18,8 +18,8 @@ import msgspec
 
 from bridge.codec import decode, encode
 from bridge.session import Session
-from cosim.errors import DirectorLost, EngineError
-from cosim.events import EventQuery, EventReply
+from cosim.core.errors import DirectorLost, EngineError
+from cosim.spec.events import EventQuery, EventReply
 
 React = Callable[[EventQuery], EventReply]
 Waiting = Callable[[str], None]
@@ -69,7 +69,7 @@ def serve_director(session: Session, key: str, react: React, by: str = "") -> No
 
 
 class RemoteDirector:
-    """The simulator's end: a `cosim.ports.Director` that asks over Zenoh.
+    """The simulator's end: a `cosim.episode.ports.Director` that asks over Zenoh.
 
     by: the version of the simulator's behaviours. wait_s: how long an answer is waited for; waiting: told so, once
     NOTICE_S are over.

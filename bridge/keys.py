@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from cosim.errors import SpecError
+from cosim.core.errors import SpecError
 
 _NAME = re.compile(r"[A-Za-z0-9_-]{1,64}")
 

@@ -12,8 +12,8 @@ from typing import Final
 import msgspec
 
 from bridge.session import Session
-from cosim.errors import EngineError, SpecError
-from cosim.injection import Ack, Injection
+from cosim.core.errors import EngineError, SpecError
+from cosim.spec.injection import Ack, Injection
 
 LARGEST_B: Final = 64 * 1024
 """Longer injections are refused unread."""

@@ -16,7 +16,7 @@ from typing import Self
 
 import zenoh
 
-from cosim.errors import EngineError
+from cosim.core.errors import EngineError
 
 Handler = Callable[[bytes], bytes]
 

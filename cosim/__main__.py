@@ -16,7 +16,7 @@ def main() -> None:
             print(f"error: {refusal}", file=sys.stderr)
             raise SystemExit(machine.EXIT_CODE)
         try:
-            from cosim.cli import main
+            from cosim.cli.app import main
         except ImportError as error:
             print(f"error: {error}. The set-up is not whole: `make run` mends it", file=sys.stderr)
             raise SystemExit(machine.EXIT_CODE) from None

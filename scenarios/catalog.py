@@ -8,8 +8,8 @@ from types import MappingProxyType
 
 import msgspec
 
-from cosim.errors import unknown
-from cosim.scenario import Scenario, Suite, read_suite
+from cosim.core.errors import unknown
+from cosim.spec.scenario import Scenario, Suite, read_suite
 
 _HERE = Path(__file__).parent / "suites"
 

@@ -11,18 +11,18 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
-from cosim.errors import EngineError, MachineError
-from cosim.events import EventQuery
+from cosim.core.errors import EngineError, MachineError
+from cosim.core.versions import versions
+from cosim.place.walk_graph import WalkGraph
 from cosim.policies.baselines import Straight
-from cosim.scenario import City, CrowdSpec, Scenario
-from cosim.versions import versions
-from cosim.walks import WalkGraph
-from physics.cameras import chosen, renderer_of
-from scenarios.assemble import staged
-from scenarios.directing import directed
-from scenarios.long_horizon import build
-from scenarios.places import place
-from sumo_nets.store import cache_folder
+from cosim.spec.events import EventQuery
+from cosim.spec.scenario import City, CrowdSpec, Scenario
+from physics.cameras.choice import chosen, renderer_of
+from scenarios.builders.long_horizon import build
+from scenarios.execution.assemble import staged
+from scenarios.execution.directing import directed
+from scenarios.execution.places import place
+from sumo_nets.city.store import cache_folder
 
 SMALL = City(seed=1, size_m=500.0)
 OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")

@@ -45,7 +45,7 @@ def pytest_configure(config: pytest.Config) -> None:
     with pytest.MonkeyPatch.context() as patch:
         for name, value in WIDE.items():
             patch.setenv(name, value)
-        importlib.import_module("cosim.cli")  # consoles look at the environment once, when they are made
+        importlib.import_module("cosim.cli.app")  # consoles look at the environment once, when they are made
 
 
 class Said(NamedTuple):

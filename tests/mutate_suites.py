@@ -21,11 +21,11 @@ from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
 
-from cosim.errors import SpecError
-from cosim.events import Kind
-from cosim.ports import Manifest, Observation
-from cosim.scenario import City, CrowdSpec, Scenario, Suite, read_suite
-from cosim.state import Command
+from cosim.core.errors import SpecError
+from cosim.core.state import Command
+from cosim.episode.ports import Manifest, Observation
+from cosim.spec.events import Kind
+from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite
 
 Tree = dict[str, Any]
 
@@ -169,7 +169,7 @@ class Fate(NamedTuple):
 
 def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
     """What becomes of each file: if it is accepted, the first scenario that is another than before is driven."""
-    from scenarios.fits import check_places
+    from scenarios.builders.fits import check_places
 
     sound = msgspec.convert(whole, Suite).scenarios
     path = folder / "mutated.json"
@@ -189,7 +189,7 @@ def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
 
 
 def _driven(scenario: Scenario, seed: int) -> Fate:
-    from scenarios.run import episode
+    from scenarios.execution.run import episode
 
     outcome = episode(msgspec.structs.replace(scenario, time_limit_s=DRIVEN_S), Ahead())
     record = outcome.record
@@ -201,9 +201,9 @@ def _driven(scenario: Scenario, seed: int) -> Fate:
 
 def small_suite(city: City) -> Tree:
     """The file of a suite in a small city: a long way, and short ones with people who talk, queue, cross, stop it."""
-    from cosim.walks import WalkGraph
-    from scenarios import long_horizon, reactive
-    from scenarios.places import place
+    from cosim.place.walk_graph import WalkGraph
+    from scenarios.builders import long_horizon, reactive
+    from scenarios.execution.places import place
 
     _, street_map = place(city)
     graph = WalkGraph(street_map)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import shapely
 
-from cosim.streetmap import Corner, Lane, Port, StreetMap, Strip
-from physics.tiles import Key, Tile, keys_within, square
+from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
+from physics.world.tiles import Key, Tile, keys_within, square
 
 KEYS = keys_within(0.0, 0.0, 60.0)
 

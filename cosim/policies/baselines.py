@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from cosim.ports import Manifest, Observation
-from cosim.state import STILL, Command
+from cosim.core.state import STILL, Command
+from cosim.episode.ports import Manifest, Observation
 
 
 class Stop:

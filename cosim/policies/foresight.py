@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cosim.geometry import Floats, Polyline, Pose, wrap_angles
+from cosim.core.geometry import Floats, Polyline, Pose, wrap_angles
 
 STEP_S: Final = 0.2
 STEPS: Final = 20

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from cosim.geometry import Floats
-from cosim.state import PERSON_RADIUS_M, People
+from cosim.core.geometry import Floats
+from cosim.core.state import PERSON_RADIUS_M, People
 
 STANDS_MPS: Final = 0.15
 GAP_M: Final = 0.9

@@ -15,11 +15,11 @@ from pathlib import Path
 
 import msgspec
 
-from cosim.clock import Clock
-from cosim.driver import Driver, Timer, told_of
-from cosim.errors import SpecError, UsageError, unknown
+from cosim.core.clock import Clock
+from cosim.core.errors import SpecError, UsageError, unknown
+from cosim.episode.driver import Driver, Timer, told_of
+from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
-from cosim.ports import CameraSpec, Manifest, Policy
 
 MOST_PX = 4096
 LONGEST_NAME = 100
@@ -88,9 +88,9 @@ def _checked(name: str, policy: Policy) -> Manifest:
         manifest = getattr(policy, "manifest", None)
         lacking = [method for method in ("reset", "act") if not callable(getattr(policy, method, None))]
     if not isinstance(manifest, Manifest):
-        raise UsageError(f"policy '{name}' has no attribute 'manifest' that is a cosim.ports.Manifest")
+        raise UsageError(f"policy '{name}' has no attribute 'manifest' that is a cosim.episode.ports.Manifest")
     if lacking:
-        raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.ports.Policy")
+        raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.episode.ports.Policy")
     try:
         manifest = msgspec.convert(msgspec.to_builtins(manifest), Manifest)
         Clock.for_rate(manifest.rate_hz)

@@ -3,7 +3,7 @@
 Each time it acts:
 
 1. what stands (groups are one obstacle) decides on a lane beside the route;
-2. what moves bends the velocity towards that lane by ORCA half-planes (`cosim.orca`), the robot doing all of the
+2. what moves bends the velocity towards that lane by ORCA half-planes (`cosim.people.orca`), the robot doing all of the
    avoiding, because people need not;
 3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to that velocity
    while the body stays clear of everybody and inside the walkable area.
@@ -20,13 +20,13 @@ import numpy as np
 import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
-from cosim.geometry import Floats, Polyline, wrap_angles
-from cosim.orca import best_velocity, half_plane
+from cosim.core.geometry import Floats, Polyline, wrap_angles
+from cosim.core.state import PERSON_RADIUS_M, Command, People
+from cosim.episode.ports import Manifest, Observation, Privileged
+from cosim.people.orca import best_velocity, half_plane
 from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, standing
 from cosim.policies.route import BODY_RADIUS_M, CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
-from cosim.ports import Manifest, Observation, Privileged
-from cosim.state import PERSON_RADIUS_M, Command, People
 
 CRUISE_MPS: Final = 1.4
 LANES_M: Final = np.arange(-8, 9) * 0.25

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from cosim.clock import Clock
-from cosim.errors import RunError
-from cosim.geometry import Floats
-from cosim.ports import Manifest, Observation
-from cosim.state import Command
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError
+from cosim.core.geometry import Floats
+from cosim.core.state import Command
+from cosim.episode.ports import Manifest, Observation
 
 
 class Replay:

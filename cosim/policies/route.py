@@ -12,9 +12,9 @@ import math
 import numpy as np
 import shapely
 
-from cosim.geometry import Floats, Polyline, wrap_angle
-from cosim.ports import Manifest, Observation, Privileged
-from cosim.state import PERSON_RADIUS_M, Command
+from cosim.core.geometry import Floats, Polyline, wrap_angle
+from cosim.core.state import PERSON_RADIUS_M, Command
+from cosim.episode.ports import Manifest, Observation, Privileged
 
 CRUISE_MPS = 1.5
 SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])

@@ -19,10 +19,10 @@ from typing import Final
 import numpy as np
 import shapely
 
-from cosim.geometry import Floats, wrap_angle
+from cosim.core.geometry import Floats, wrap_angle
+from cosim.core.state import PERSON_RADIUS_M, Command, People
+from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.policies.route import W_RADPS, crossing_limit
-from cosim.ports import Manifest, Observation, Privileged
-from cosim.state import PERSON_RADIUS_M, Command, People
 
 DESIRED_MPS: Final = 1.34
 """The paper's mean desired speed."""

@@ -13,11 +13,11 @@ import shapely
 from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
-from cosim.geometry import Floats
-from cosim.record import Log, Record
+from cosim.core.geometry import Floats
+from cosim.place.street_map import Lane, StreetMap
+from cosim.records.record import Log, Record
 from cosim.report.legend import Colour, Image, legend, wide_px
-from cosim.scenario import Scenario
-from cosim.streetmap import Lane, StreetMap
+from cosim.spec.scenario import Scenario
 
 MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400

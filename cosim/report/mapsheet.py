@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.errors import unwritable
-from cosim.mapcheck import MapCheck
+from cosim.core.errors import unwritable
+from cosim.place.map_check import MapCheck
+from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import TRACK, Sheet, draw_streets
 from cosim.report.legend import Colour, Image, legend
-from cosim.streetmap import StreetMap, Strip
 
 MARGIN_M: Final = 20.0
 SIGNAL: Final[Colour] = (30, 150, 60)

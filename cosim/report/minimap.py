@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
+from cosim.core.state import PERSON_RADIUS_M, People, RobotState, Street
+from cosim.place.street_map import StreetMap
 from cosim.report.above import BARRIER, EVENT, GROUND, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
 from cosim.report.legend import Colour, Image
-from cosim.scenario import Scenario
-from cosim.state import PERSON_RADIUS_M, People, RobotState, Street
-from cosim.streetmap import StreetMap
+from cosim.spec.scenario import Scenario
 
 REACH_M: Final = 11.0
 """Metres from the middle of the map to its nearer borders."""

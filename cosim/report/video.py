@@ -10,7 +10,7 @@ import av
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.errors import RunError, unwritable
+from cosim.core.errors import RunError, unwritable
 
 MOST_PX = 4096
 """Longest side of a video."""

@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton

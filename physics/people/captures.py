@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
-from cosim.errors import EngineError
-from cosim.geometry import Floats
+from cosim.core.errors import EngineError
+from cosim.core.geometry import Floats
 from physics.people.skeleton import INDEX, model_pose, rodrigues
 
 _COLUMNS: Final = {

@@ -11,8 +11,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.gait import PACES_MPS
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
+from cosim.people.gait import PACES_MPS
 from physics.people.captures import Capture
 from physics.people.families import FAMILIES, Family, skeleton
 from physics.people.gaits import FRAMES as STRIDE_FRAMES

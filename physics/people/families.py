@@ -7,7 +7,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
 from physics.people.skeleton import INDEX, JOINTS, MIRRORED, Skeleton
 
 Family = Literal["man", "woman", "child", "elder"]

@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from cosim.gait import PACES_MPS, REFERENCE_M, STRIDES_M
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
+from cosim.people.gait import PACES_MPS, REFERENCE_M, STRIDES_M
 from physics.people.captures import Capture, capture
 from physics.people.limbs import about_y, about_z, set_leg
 from physics.people.skeleton import INDEX, MIRRORED, Skeleton, axis_angle, rodrigues
@@ -85,7 +85,7 @@ class _Cycle:
 
 
 def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0, walk: Capture | None = None) -> tuple[Floats, Floats]:
-    """The stride at the pace `cosim.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis (FRAMES, 3) metres.
+    """The stride at the pace `cosim.people.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis (FRAMES, 3) metres.
 
     The body stays above the origin. stoop_rad: how far the back is bent. walk: one stride, from one touch of the left
     heel to the next, whose trunk, head and arms are taken instead of the shipped walk's.

@@ -11,8 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from cosim.gait import REFERENCE_M
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
+from cosim.people.gait import REFERENCE_M
 from physics.people.limbs import about_y, about_z, set_arm, set_leg
 from physics.people.skeleton import INDEX, Skeleton, rodrigues
 

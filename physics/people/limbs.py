@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
 from physics.people.skeleton import INDEX, Skeleton
 
 

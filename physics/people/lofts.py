@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.geometry import Floats
+from cosim.core.geometry import Floats
 from physics.people.skeleton import INDEX
 
 Joints = Mapping[str, float]

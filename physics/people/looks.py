@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.gait import age_of, is_woman
+from cosim.people.gait import age_of, is_woman
 from physics.people.body import COATS, Outfit
 from physics.people.families import Family
 from physics.people.figure import Build

@@ -8,15 +8,15 @@ from typing import Final
 
 import numpy as np
 
-from cosim.geometry import Floats
-from cosim.state import People
-from physics.mesh import Mesh, box, frustum, join
+from cosim.core.geometry import Floats
+from cosim.core.state import People
 from physics.people.body import COATS
 from physics.people.clips import bind_of, own_clips
 from physics.people.families import Family, skeleton
 from physics.people.looks import ALL, family_of, look
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, model_pose
+from physics.world.mesh import Mesh, box, frustum, join
 
 Colour = tuple[float, float, float]
 

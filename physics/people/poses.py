@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.gait import PACES_MPS, first_stride, relative_pace, stature_m
-from cosim.geometry import Floats
-from cosim.state import People
+from cosim.core.geometry import Floats
+from cosim.core.state import People
+from cosim.people.gait import PACES_MPS, first_stride, relative_pace, stature_m
 from physics.people.clips import Clips, own_clips
 from physics.people.families import FAMILIES, Family
 from physics.people.looks import family_of

@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.errors import SpecError
-from cosim.geometry import Floats
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Floats
 from physics.people.body import COATS, Body, smooth_normals, strongest
 from physics.people.captures import Capture
 from physics.people.skeleton import INDEX, JOINTS, PARENTS, Skeleton, forward, rodrigues

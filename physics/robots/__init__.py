@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from cosim.errors import unknown
+from cosim.core.errors import unknown
 
 
 @dataclass(frozen=True, slots=True)

@@ -241,7 +241,7 @@ SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
     "gravel": ("gravel",),
     "earth": ("earth", "gravel"),
 }
-"""Layers that a kind of ground (physics.tiles) or a material (physics.materials) may show."""
+"""Layers that a kind of ground (physics.world.tiles) or a material (physics.world.materials) may show."""
 
 
 def layer_of(surface: str, seed: int = 0) -> str:

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.errors import SpecError, UsageError, unknown
+from cosim.core.errors import SpecError, UsageError, unknown
 from physics.textures.noise import Field, Noise
 
 Rgb = NDArray[np.floating[Any]]

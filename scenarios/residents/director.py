@@ -14,15 +14,15 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.events import EventQuery, EventReply
-from cosim.geometry import Floats
-from cosim.ports import Director
-from cosim.scenario import Scenario
-from cosim.state import People
-from cosim.steering import NEAR_M, Neighbour
-from cosim.streetmap import StreetMap
-from physics.ground import Ground
-from scenarios.behaviors.sight import SHARED, STILL_MPS
+from cosim.core.geometry import Floats
+from cosim.core.state import People
+from cosim.episode.ports import Director
+from cosim.people.steering import NEAR_M, Neighbour
+from cosim.place.street_map import StreetMap
+from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.scenario import Scenario
+from physics.world.ground import Ground
+from scenarios.events.sight import SHARED, STILL_MPS
 from scenarios.residents.graph import BehaviorGraph, behavior_graph
 from scenarios.residents.resident import (
     SPEED_MPS,
@@ -36,7 +36,7 @@ from scenarios.residents.resident import (
     drawn_waypoint,
     wants_to_choose,
 )
-from sumo_nets.demand import CLEAR_M, SIGHT_M
+from sumo_nets.crowd.demand import CLEAR_M, SIGHT_M
 
 WITHIN_M: Final = 60.0
 """Residents appear no farther from the robot."""

@@ -20,17 +20,17 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 from shapely.geometry import LineString
 
-from cosim import overlay
-from cosim.geometry import Floats, Polyline
-from cosim.scenario import Barrier
-from cosim.state import PERSON_RADIUS_M
-from cosim.streetmap import Corner, Lane, StreetMap, Strip, union_closed
-from physics.furniture import footprints
-from physics.ground import Ground
-from physics.pastimes import Spot, What, spots
-from physics.placement import CLEAR_HALF_M
-from physics.tiles import key_at
-from scenarios.barriers import outline
+from cosim.core.geometry import Floats, Polyline
+from cosim.core.state import PERSON_RADIUS_M
+from cosim.place import overlay
+from cosim.place.street_map import Corner, Lane, StreetMap, Strip, union_closed
+from cosim.spec.scenario import Barrier
+from physics.street.furniture import footprints
+from physics.street.interaction_spots import Spot, What, spots
+from physics.street.placement import CLEAR_HALF_M
+from physics.world.ground import Ground
+from physics.world.tiles import key_at
+from scenarios.builders.barriers import outline
 
 REACH_M: Final = 55.0
 """The graph covers the sidewalks this near to the route."""

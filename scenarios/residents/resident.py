@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 from shapely import covers
 from shapely.geometry import LineString
 
-from cosim.events import Actor, EventQuery
-from cosim.geometry import wrap_angle
-from cosim.giveway import stepped_round, within_reach_m
-from cosim.state import Doing
-from cosim.steering import LEAST_M, Neighbour, Vector, steered
-from scenarios.behaviors.walking import robot_of, turned
+from cosim.core.geometry import wrap_angle
+from cosim.core.state import Doing
+from cosim.people.steering import LEAST_M, Neighbour, Vector, steered
+from cosim.people.yielding import stepped_round, within_reach_m
+from cosim.spec.events import Actor, EventQuery
+from scenarios.events.walking import robot_of, turned
 from scenarios.residents.graph import BehaviorGraph
 
 SPEED_MPS: Final = (1.1, 1.65)
@@ -39,7 +39,7 @@ LOOKS_AHEAD_TICKS: Final = 8
 GIVES_UP_S: Final = 3.0
 """Who makes no way for so long goes elsewhere."""
 TREADS_MPS: Final = 0.25
-"""What a body shows that turns on the spot: `cosim.gait` blends from it into what it does next."""
+"""What a body shows that turns on the spot: `cosim.people.gait` blends from it into what it does next."""
 LEAVES_S: Final = 0.55
 """How long a body takes from what it did, such as sitting, to the pose in which it treads; it stays where it is."""
 LEAVES_MPS: Final = 0.3

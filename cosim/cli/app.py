@@ -1,0 +1,352 @@
+"""The command line: `cosim run`, `list`, `show`, `doctor`."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+import sys
+from contextlib import ExitStack
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+
+from cosim.cli.bench import bench
+from cosim.cli.board import Board
+from cosim.cli.city import city_app
+from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
+from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
+from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
+from cosim.cli.map import map_app
+from cosim.cli.output import told_streams
+from cosim.cli.progress import doing
+from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    rich_markup_mode="markdown",
+    pretty_exceptions_enable=False,
+    help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
+    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`",
+)
+LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
+out = Console()
+err = Console(stderr=True)
+
+
+def say_versions(asked: bool) -> None:
+    """Print the versions and end, if asked for."""
+    if asked:
+        from cosim.core.versions import in_words
+
+        typer.echo(in_words())
+        raise typer.Exit
+
+
+@app.callback()
+def common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=say_versions, is_eager=True, help="Say the versions and end.")
+    ] = False,
+) -> None:
+    """Options of `cosim` itself."""
+
+
+@app.command(
+    epilog="Examples:  \n"
+    "`cosim run long-horizon --policy route --episodes 2`  \n"
+    "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
+    "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
+    "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
+    "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
+    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`"
+)
+def run(
+    suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
+    policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
+    scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
+    event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
+    map_name: Annotated[
+        str | None, typer.Option("--map", help="Draw on this place in place of the suite's: a map, a folder, a net.")
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Of the routes drawn with --map.")] = 0,
+    roughness: Annotated[
+        float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
+    ] = None,
+    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
+    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
+    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
+    frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    live: Annotated[
+        str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
+    ] = None,
+    director: Annotated[
+        str | None, typer.Option(help="Ask the director at this endpoint, a process of its own: see `cosim direct`.")
+    ] = None,
+    director_wait: Annotated[
+        float, typer.Option(min=0.1, max=LONGEST_WAIT_S, help="Seconds to wait for it; then the episode has crashed.")
+    ] = 60.0,
+    answer_timeout: Annotated[
+        float, typer.Option(min=0.1, help="Seconds a policy may take to answer; then its episode has crashed.")
+    ] = 60.0,
+    start_timeout: Annotated[
+        float, typer.Option(min=0.1, help="The same for loading it, for its reset, and for the first answer after it.")
+    ] = 300.0,
+    counterfactual: Annotated[
+        bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
+    ] = False,
+) -> None:
+    """Run a suite with a policy and print its table."""
+    from bridge import keys
+    from bridge.director import Outside
+    from bridge.session import Session
+    from cosim.cli.tables import kinds_of, print_by_kind, print_table
+    from cosim.core.versions import versions
+    from cosim.policies.load import load_policy
+    from cosim.records.record import NO_RENDERER
+    from cosim.records.run_folder import RunFolder, RunSpec
+    from cosim.spec.injection import Live
+    from physics.cameras.choice import renderer_of
+    from scenarios.builders.fits import LOOKING, check_places
+    from scenarios.catalog import chosen, with_crowd
+    from scenarios.catalog import suite as shipped
+    from scenarios.execution.asked import Patience
+    from scenarios.execution.pace import announcement, remembered
+    from scenarios.execution.pool import run_all
+
+    if map_name is not None:
+        from scenarios.builders.sample import suite_on_map
+
+        with doing(f"drawing routes on {map_name}"):
+            whole = suite_on_map(suite, map_name, seed, episodes, roughness or 0.0, event or ())
+        err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
+    elif roughness is not None:
+        raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
+    else:
+        whole = shipped(suite)
+    whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
+    picked = chosen(whole, scenario or (), episodes, event or ())
+    loaded = load_policy(policy)
+    manifest = loaded.manifest
+    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
+    spec = RunSpec(
+        suite=whole.name,
+        suite_version=whole.version,
+        suite_hash=whole.content_hash,
+        policy=policy,
+        policy_name=manifest.name,
+        policy_version=manifest.version,
+        policy_source=loaded.source_hash,
+        scenarios=tuple(s.id for s in picked),
+        versions=versions(),
+        renderer=renderer_of(drawn_by) if manifest.camera is not None else NO_RENDERER,
+        counterfactual=counterfactual,
+    )
+    if resume and folder is None:
+        raise UsageError("--resume needs --out: the folder of the run to finish")
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
+    with doing(LOOKING) as tell:
+        check_places(whole, picked, tell)
+    on_air = None if live is None else Live(endpoint=checked_endpoint(live, "--live"), run=keys.chunk(path.name))
+    outside = None
+    if director is not None:
+        endpoint = checked_endpoint(director, "--director")
+        outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
+    with ExitStack() as stack:
+        if on_air is not None:
+            stack.enter_context(Session.hub(on_air.endpoint))
+            err.print(f"On the air at {on_air.endpoint}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
+        held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
+        stack.enter_context(held)
+        for note in held.notes:
+            err.print(note, soft_wrap=True, markup=False, highlight=False)
+        done = held.finished()
+        todo = [s for s in picked if s.id not in done]
+        if done:
+            err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
+        if todo:
+            words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
+            err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
+        board = Board(picked, done, compared=counterfactual)
+        try:
+            with board.bars, remembered(held, todo, jobs):
+                run_all(
+                    held,
+                    todo,
+                    policy,
+                    loaded,
+                    jobs=jobs,
+                    tell=board.tell,
+                    frames_every_s=frames,
+                    camera=drawn_by,
+                    live=on_air,
+                    outside=outside,
+                    patience=Patience(answer_timeout, start_timeout),
+                )
+        except KeyboardInterrupt:
+            finished = len(held.finished())
+            again = shlex.join(a for a in sys.argv[1:] if a != "--resume")
+            again += "" if folder else f" --out {shlex.quote(str(path))}"
+            err.print(f"Stopped. {finished} of {len(picked)} episodes are finished and kept in {path}.")
+            err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
+            raise typer.Exit(INTERRUPTED) from None
+        table = held.finish()
+    print_table(out, table, len(picked))
+    print_by_kind(out, table, kinds_of(path))
+    out.print(f"Run folder: {path}", soft_wrap=True)
+    if lacking := [s.id for s in picked if s.id not in set(table["scenario"])]:
+        err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
+    if lacking or (table["status"] == "crashed").any():
+        raise typer.Exit(SOME_CRASHED)
+
+
+@app.command("list", epilog="Examples:  \n`cosim list`  \n`cosim list reactive`")
+def list_all(
+    suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
+) -> None:
+    """List the suites and policies, or the scenarios of a suite."""
+    from cosim.cli.tables import print_scenarios
+    from cosim.policies import POLICIES
+    from scenarios.catalog import SUITES
+    from scenarios.catalog import suite as shipped
+
+    if suite is None:
+        for name in SUITES:
+            whole = shipped(name)
+            out.print(
+                f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}"
+            )
+        for name, make in POLICIES.items():
+            out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+        return
+    print_scenarios(out, shipped(suite))
+
+
+@app.command(
+    epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --events`  \n"
+    "`cosim show runs/mine --episode lh-011-00 -o episode.png`"
+)
+def show(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str | None, typer.Option(help="One episode: its failures and events, and a picture.")] = None,
+    picture: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Where to write the episode's picture.")
+    ] = None,
+    events: Annotated[
+        bool, typer.Option("--events", help="What was measured of every event, from its tracks.")
+    ] = False,
+) -> None:
+    """Show the table of a run, finished or not, or one episode as a picture from above."""
+    from cosim.cli.tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
+    from cosim.records.results import table_of
+    from cosim.records.run_folder import read_records, read_spec
+
+    spec = read_spec(folder)
+    records = {record.scenario: record for record in read_records(folder)}
+    if events:
+        if episode is not None:
+            raise UsageError("--events is about a whole run: leave --episode out")
+        from scenarios.viewing.eventsheet import sheet_of_run
+
+        print_sheet(out, sheet_of_run(folder))
+        return
+    if episode is None:
+        table = table_of(records.values())
+        print_table(out, table, len(spec.scenarios))
+        print_by_kind(out, table, kinds_of(folder))
+        return
+    if episode not in records:
+        from cosim.core.errors import unknown
+
+        raise unknown(f"finished episode in {folder}", episode, records)
+    from scenarios.viewing.picture import draw_episode
+
+    record = records[episode]
+    print_episode(out, record)
+    if record.status == "done":
+        path = picture or folder / "episodes" / episode / "above.png"
+        with doing(f"drawing {episode}"):
+            draw_episode(folder, episode, path)
+        out.print(f"Picture: {path}", soft_wrap=True)
+
+
+@app.command(epilog="Example:  \n`cosim doctor`")
+def doctor() -> None:
+    """Check that every engine works here: versions, a frame, a query, a step."""
+    try:
+        from scenarios.checks import CHECKS
+    except ImportError as error:
+        raise EngineError(f"an engine cannot be loaded: {error}. Mend what it names, or set up anew") from error
+
+    failed = 0
+    for name, check in CHECKS.items():
+        try:
+            out.print(f"[green]ok[/]      {name}: {check()}", soft_wrap=True)
+        except Exception as error:  # noqa: BLE001  a check may fail in any way; it is shown and counted
+            failed += 1
+            out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {escape(str(error))}", soft_wrap=True)
+    if failed:
+        raise typer.Exit(BROKEN_MACHINE)
+
+
+app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`",
+)(look)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(
+    film
+)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
+app.command("counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(
+    compare_one
+)
+app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Examples:  \n"
+    '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
+    "`cosim inject @anna.json --env mine/lh-011-00 --wait 60`",
+)(inject)
+app.command(
+    rich_help_panel=STEP_IN, epilog="Examples:  \n`cosim listen robot --seconds 5`  \n`cosim listen events --wait 60`"
+)(listen)
+app.command(
+    rich_help_panel=STEP_IN,
+    epilog="Example, in two terminals:  \n`cosim direct --listen tcp/127.0.0.1:7448`  \n"
+    "`cosim run reactive --event frontal --policy orca --director tcp/127.0.0.1:7448`",
+)(direct)
+app.command(
+    rich_help_panel=MEASURE,
+    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
+    "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
+)(bench)
+app.add_typer(city_app, name="city", rich_help_panel=PLACES)
+app.add_typer(map_app, name="map", rich_help_panel=PLACES)
+
+
+def main() -> None:
+    """Run the command line. SIGTERM ends it as Ctrl-C does: exit code 130, nothing half-written is left."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with told_streams():
+        try:
+            app()
+        except CosimError as error:
+            err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
+            raise SystemExit(error.exit_code) from None
+
+
+if __name__ == "__main__":
+    main()

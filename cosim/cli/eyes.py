@@ -1,0 +1,137 @@
+"""The command line for eyes: `cosim look`, `cosim film`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+from rich.console import Console
+
+from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
+from cosim.cli.progress import doing
+from cosim.core.errors import MachineError, UsageError, unknown
+
+if TYPE_CHECKING:
+    from scenarios.viewing.look import View
+
+PICTURES = (".png", ".jpg", ".jpeg")
+out = Console()
+err = Console(stderr=True)
+
+Choice = Literal["auto", "gl", "bullet", "bullet-egl"]
+CAMERA_HELP = (
+    "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), bullet-egl (bare, by OpenGL), or auto: gl "
+    "where it works, else bullet."
+)
+RESIDENTS_HELP = "In place of the scenario's: so many people who sit on benches, look into shop windows, wait at stops."
+
+
+def camera_here(choice: Choice) -> Literal["gl", "bullet", "bullet-egl"]:
+    """The camera that a choice comes to on this machine; says so where auto is not gl. Raises EngineError."""
+    from physics.cameras.choice import chosen
+
+    name = chosen(choice)
+    if choice == "auto" and name == "bullet":
+        err.print("No OpenGL here: the bullet camera draws the pictures (`cosim doctor` says why).")
+    return name
+
+
+def look(
+    scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
+    at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,
+    view: Annotated[str, typer.Option(help="robot, follow (from behind) or above.")] = "robot",
+    size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
+    suite: Annotated[
+        str | None, typer.Option(help="Where the scenario is: a suite or a suite's .json file; by default looked up.")
+    ] = None,
+    policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
+    elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
+    children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture.")] = Path("look.png"),
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
+    from scenarios.catalog import chosen, holding, with_crowd
+    from scenarios.catalog import suite as shipped
+    from scenarios.viewing.look import look
+
+    picked = view_of(view)
+    pixels = size_of(size)
+    check_picture(output)
+    found = holding(scenario) if suite is None else shipped(suite)
+    whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
+    (one,) = chosen(whole, [scenario])
+    with doing("choosing the camera") as tell:
+        image, time_s = look(one, policy, at, picked, pixels, camera_here(camera), tell)
+    save(image, output)
+    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
+
+
+def film(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Where to write the film, an .mp4.")] = Path(
+        "film.mp4"
+    ),
+    start: Annotated[float, typer.Option("--from", min=0.0, help="First second.")] = 0.0,
+    end: Annotated[float | None, typer.Option("--to", help="Last second; by default the end.")] = None,
+    size: Annotated[str, typer.Option(help="Width x height in pixels, both even.")] = "1280x720",
+    view: Annotated[str, typer.Option(help="follow (from behind), above, or robot: what it sees.")] = "follow",
+    speed: Annotated[int, typer.Option(min=1, max=32, help="Times real time.")] = 1,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Film an episode of a run: from behind the robot or above it, with what it sees, the map, events and failures."""
+    from scenarios.viewing.film import Cut, film
+
+    picked = view_of(view)
+    until_s = math.inf if end is None else end
+    with doing("choosing the camera") as tell:
+        cut = Cut(start, until_s, size_of(size), speed, camera_here(camera), picked)
+        to_s = film(folder, episode, output, cut, tell)
+    same = (
+        "the state hash is the record's" if to_s == math.inf else f"of its first {to_s:g} s every tick is as recorded"
+    )
+    out.print(f"Film: {output} ({same})", soft_wrap=True, highlight=False)
+
+
+def view_of(name: str) -> View:
+    """The view called so. Raises UsageError with the valid names."""
+    from scenarios.viewing.look import VIEWS
+
+    for view in VIEWS:
+        if view == name:
+            return view
+    raise unknown("view", name, VIEWS)
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """Width and height in "1280x720". Raises UsageError."""
+    parts = text.lower().split("x")
+    if len(parts) != 2 or not all(part.isdecimal() and 16 <= int(part) <= 4096 for part in parts):
+        raise UsageError(f"--size '{text}': give width x height in pixels, each from 16 to 4096, like 1280x720")
+    return int(parts[0]), int(parts[1])
+
+
+def check_picture(path: Path) -> None:
+    """Before it is drawn: raises UsageError when no picture can have this name, MachineError without its folder."""
+    if path.suffix.lower() not in PICTURES:
+        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg")
+    if not path.resolve().parent.is_dir():
+        raise MachineError(f"{path}: cannot be written: no folder {path.parent}")
+
+
+def save(image: object, path: Path) -> None:
+    """Write a picture. Raises MachineError when it cannot be written there."""
+    import cv2
+    import numpy as np
+
+    try:
+        written = cv2.imwrite(str(path), np.asarray(image)[..., ::-1])
+    except cv2.error as error:
+        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg") from error
+    if not written:
+        raise MachineError(f"{path}: the picture cannot be written there")

@@ -1,0 +1,180 @@
+"""Tables of the command line: of a run, of its kinds of events, of one episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import pandas as pd
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Column, Table
+
+from cosim.core.clock import Clock
+from cosim.judge.metrics import COUNTERFACTUAL, METRICS
+from cosim.records.record import Record
+from cosim.records.results import interval_of, summary_of
+from cosim.spec.scenario import Scenario, Suite, read_suite
+
+SHOWN = (
+    ("success", "SR"),
+    ("route_completion", "RC"),
+    ("failures_per_100m", "FC"),
+    ("collisions_per_100m", "C"),
+    ("out_of_lane_per_100m", "OL"),
+    ("freezings_per_100m", "F"),
+    ("velocity_mean_mps", "V"),
+)
+LETTERS = {
+    "SR": "success: the goal reached in time without a failure",
+    "RC": "share of the route done",
+    "FC": "failures per 100 m",
+    "C": "collisions per 100 m",
+    "OL": "out of lane per 100 m",
+    "F": "freezings per 100 m",
+    "V": "mean speed",
+}
+"""What a letter means, in every table: what is counted otherwise has no letter."""
+UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
+COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
+BY_KIND = (
+    ("collisions", "collided"),
+    ("out_of_lane", "left\nlane"),
+    ("freezings", "froze"),
+    ("rules_broken", "broke\nrule"),
+)
+"""Shares of the episodes of a kind of event: each ends on its first failure."""
+
+
+def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
+    """The table of a run: a row per episode, then the means with their intervals. Made for 80 columns."""
+    heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
+    shown = Table(
+        Column("episode", no_wrap=True), Column("ended", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0
+    )
+    for _, row in table.iterrows():
+        counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
+        ended = row["ended"] if row["status"] == "done" else row["status"]
+        shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
+    out.print(shown)
+    counted = "/".join(name for _, name in COUNTS)
+    out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
+    if len(table):
+        means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
+        for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
+            interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+            means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
+        out.print(means)
+    print_delays(out, table)
+    crashed = table[table["status"] == "crashed"]
+    invalid = table[table["status"] == "invalid"]
+    counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
+    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
+    for _, row in pd.concat([crashed, invalid]).iterrows():
+        out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+
+
+def print_scenarios(out: Console, suite: Suite) -> None:
+    """A row per scenario of a suite: made for 80 columns."""
+    heads = ("scenario", "place", "route\nm", "cross-\nings", "events", "bar-\nriers", "limit\ns")
+    shown = Table(*(Column(head, no_wrap=True) for head in heads), box=box.SIMPLE_HEAD, padding=0)
+    for s in suite.scenarios:
+        events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
+        numbers = (f"{s.route_line.length_m:.0f}", str(len(s.crossings)), events, str(len(s.barriers)))
+        shown.add_row(s.id, escape(s.place.name), *numbers, f"{s.time_limit_s:.0f}")
+    out.print(shown)
+
+
+def print_delays(out: Console, table: pd.DataFrame) -> None:
+    """What the robot cost others, per episode, in a run that was asked to compare; nothing in any other."""
+    if not set(COUNTERFACTUAL) <= set(table.columns):
+        return
+    shown = Table("against the same street without the robot", "per episode", "95 % interval", "n", box=box.SIMPLE_HEAD)
+    for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
+        interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+        shown.add_row(str(name), _cell(row["mean"]), interval, f"{row['n']:.0f}")
+    out.print(shown)
+
+
+def print_episode(out: Console, record: Record) -> None:
+    """One episode in words: how it ended, every failure, every event, every metric."""
+    out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
+    for failure in record.failures:
+        what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
+        fault = f", {failure.fault}" if failure.fault else ""
+        out.print(f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
+    for event in record.events:
+        at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
+        out.print(f"  event {event.id} {event.kind}: {at}")
+    table = Table("metric", "value", "unit")
+    for name, metric in METRICS.items():
+        table.add_row(name, _cell(record.measures.get(name)), metric.unit)
+    for name, unit in COUNTERFACTUAL.items():
+        if name in record.measures:
+            table.add_row(name, _cell(record.measures[name]), unit)
+    out.print(table)
+
+
+def _cell(value: float | None) -> str:
+    return "-" if value is None or pd.isna(value) else f"{value:.2f}"
+
+
+def kinds_of(folder: Path) -> Mapping[str, str]:
+    """The kind of event that each scenario of a run is about; empty where they are about the way."""
+    return {s.id: s.events[0].kind for s in read_suite(folder / "scenarios.json").scenarios if about_one_event(s)}
+
+
+def about_one_event(scenario: Scenario) -> bool:
+    """Whether a scenario is there for its one event."""
+    return scenario.ends_on_failure and len(scenario.events) == 1
+
+
+def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
+    """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
+    if len(set(kinds.values())) < 2:
+        return
+    heads = ("n", "SR", "95 % of SR", *(head for _, head in BY_KIND), "invalid", "nearest\nm")
+    numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
+    shown = Table(Column("event", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
+    for kind in dict.fromkeys(kinds.values()):
+        part = table[table["scenario"].map(kinds) == kind]
+        success, *shares = (
+            pd.to_numeric(part[name], errors="coerce").dropna() for name in ("success", *(name for name, _ in BY_KIND))
+        )
+        low, high = interval_of(success.to_numpy(dtype=float))
+        nearest = pd.to_numeric(part["pedestrian_distance_min_m"], errors="coerce").min()
+        interval = f"{low:.2f}..{high:.2f}" if len(success) else "-"
+        invalid = str((part["status"] == "invalid").sum())
+        cells = (_cell(values.mean()) for values in shares)
+        shown.add_row(kind, str(len(part)), _cell(success.mean()), interval, *cells, invalid, _cell(nearest))
+    out.print(shown)
+    named = ", ".join(head.replace("\n", " ") for _, head in BY_KIND)
+    out.print(f"n episodes; {named}: share of the event's episodes; nearest: least distance to a person's centre")
+
+
+def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
+    """What was measured of each event of a run (`scenarios.viewing.eventsheet`), and two summaries by kind: for 80 columns."""
+    from scenarios.viewing.eventsheet import summary
+
+    heads = ("trigger\nm", "error\nm", "tick\nm", "speed\nm/s", "stated\nm/s", "left\nm", "angle\ndeg", "least\nm")
+    columns = (Column(head, justify="right", no_wrap=True) for head in heads)
+    rows = Table(Column("episode", overflow="fold"), *columns, box=box.SIMPLE_HEAD, padding=0)
+    for row in sheet.itertuples(index=False):
+        name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
+        numbers = (f"{value:.{digits}f}" for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True))
+        rows.add_row(name, *("-" if n == "nan" else n for n in numbers))
+    out.print(rows)
+    for short in summary(sheet):
+        columns = (Column(head, no_wrap=True) for head in short.columns)
+        table = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+        for row in short.itertuples(index=False):
+            table.add_row(*(str(value) for value in row))
+        out.print(table)
+    out.print(
+        "trigger: from the robot to the event's place, when it began; error: off what is stated; tick: what the robot "
+        "drove in a tick, the most that the error may be; off: triggers beyond that; speed: of the person while it "
+        "walks, stated: of the scenario; left: of the middle of the way; angle: of its walk to the robot's heading; "
+        "least: distance between the centres of person and robot"
+    )

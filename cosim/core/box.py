@@ -1,0 +1,18 @@
+"""A box on a map, as the command line takes it."""
+
+from __future__ import annotations
+
+from cosim.core.errors import UsageError
+
+Box = tuple[float, float, float, float]
+
+
+def box_of(option: str, words: str, sides: str = "west,south,east,north") -> Box:
+    """The four numbers in the words of an option. Raises UsageError naming the option and its `sides`."""
+    try:
+        x0, y0, x1, y1 = (float(word) for word in words.split(","))
+    except ValueError:
+        raise UsageError(f"{option} takes four numbers with commas between them, not '{words}'") from None
+    if not (x0 < x1 and y0 < y1):
+        raise UsageError(f"{option} is {sides}: '{words}' is empty")
+    return x0, y0, x1, y1

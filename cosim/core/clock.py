@@ -1,0 +1,64 @@
+"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs substeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from cosim.core.errors import SpecError
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """The three periods of an episode, in whole milliseconds, checked once to divide each other.
+
+    tick_ms: one step of crowd, director and referee. substep_ms: one step of the physics.
+    policy_ms: the policy's own period; its command is held in between.
+    """
+
+    tick_ms: int = 50
+    substep_ms: int = 5
+    policy_ms: int = 250
+
+    def __post_init__(self) -> None:
+        if min(self.tick_ms, self.substep_ms, self.policy_ms) <= 0:
+            raise SpecError(f"periods must be positive: {self}")
+        if self.tick_ms % self.substep_ms:
+            raise SpecError(f"a tick of {self.tick_ms} ms is no whole number of {self.substep_ms} ms substeps")
+        if self.policy_ms % self.tick_ms:
+            rates = ", ".join(f"{1000 // n}" for n in (250, 200, 100, 50))
+            raise SpecError(
+                f"a policy period of {self.policy_ms} ms is no whole number of {self.tick_ms} ms ticks; "
+                f"usual policy rates are {rates} Hz"
+            )
+
+    @classmethod
+    def for_rate(cls, policy_hz: float) -> Clock:
+        """The clock of a policy that acts `policy_hz` times a simulated second."""
+        if not policy_hz > 0:
+            raise SpecError(f"a policy rate must be positive, not {policy_hz} Hz")
+        return cls(policy_ms=round(1000 / policy_hz))
+
+    @property
+    def substeps(self) -> int:
+        """Physics substeps per tick."""
+        return self.tick_ms // self.substep_ms
+
+    @property
+    def tick_s(self) -> float:
+        return self.tick_ms / 1000
+
+    @property
+    def substep_s(self) -> float:
+        return self.substep_ms / 1000
+
+    def time_s(self, tick: int) -> float:
+        """Simulated seconds at the start of `tick`."""
+        return tick * self.tick_ms / 1000
+
+    def ticks(self, seconds: float) -> int:
+        """Ticks in `seconds`, to the nearest."""
+        return round(seconds * 1000 / self.tick_ms)
+
+    def acts(self, tick: int) -> bool:
+        """Whether the policy is asked at `tick`."""
+        return tick % (self.policy_ms // self.tick_ms) == 0

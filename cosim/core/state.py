@@ -1,0 +1,206 @@
+"""Snapshots of a moment: frozen values that travel between the engines.
+
+Arrays are write-protected; positions are world metres, headings radians counter-clockwise from +x, speeds m/s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats, Pose
+
+PERSON_RADIUS_M = 0.3
+"""Radius of every pedestrian's collision cylinder."""
+
+Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
+"""What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand, reading a
+phone, sitting on a seat behind the place where it is."""
+
+
+def frozen(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+    """A write-protected copy of `array`."""
+    copy = np.array(array, dtype=dtype)
+    if shape is not None:
+        copy = copy.reshape(shape)
+    copy.flags.writeable = False
+    return copy
+
+
+@dataclass(frozen=True, slots=True)
+class RobotState:
+    """The robot: pose of the base centre on the ground plane, body speeds, height and tilt of the base.
+
+    v_mps along the heading, w_radps counter-clockwise; z_m height of the base frame; tilt_rad angle between the
+    base's up axis and the vertical.
+    """
+
+    pose: Pose
+    v_mps: float = 0.0
+    w_radps: float = 0.0
+    z_m: float = 0.0
+    tilt_rad: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class People:
+    """Pedestrians of a moment. ids: N unique names, sorted; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
+
+    strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
+    shows, which follows the speed as one starts and stops (`cosim.people.gait`). Both are for pictures: nothing else reads
+    them. Background walkers have ids that start with "c", event pedestrians with "e",
+    residents (`CrowdSpec.residents`) with "n".
+    """
+
+    ids: tuple[str, ...]
+    xy: Floats
+    heading: Floats
+    speed: Floats
+    doing: tuple[Doing, ...]
+    strides: Floats
+    pace: Floats
+
+    @classmethod
+    def of(
+        cls,
+        ids: tuple[str, ...],
+        xy: Any,
+        heading: Any,
+        speed: Any,
+        doing: tuple[Doing, ...],
+        strides: Any = None,
+        pace: Any = None,
+    ) -> People:
+        """Without strides and pace: people at the beginning of a stride, at the pace of their speed."""
+        n = len(ids)
+        return cls(
+            ids,
+            frozen(xy, shape=(n, 2)),
+            frozen(heading, shape=(n,)),
+            frozen(speed, shape=(n,)),
+            doing,
+            frozen(np.zeros(n) if strides is None else strides, shape=(n,)),
+            frozen(speed if pace is None else pace, shape=(n,)),
+        )
+
+    def only(self, rows: NDArray[np.intp]) -> People:
+        """Those in these rows."""
+        if len(rows) == len(self.ids) and (rows == np.arange(len(rows))).all():
+            return self
+        arrays = [array[rows] for array in (self.xy, self.heading, self.speed, self.strides, self.pace)]
+        for array in arrays:
+            array.flags.writeable = False
+        xy, heading, speed, strides, pace = arrays
+        chosen = rows.tolist()
+        ids, doing = tuple([self.ids[i] for i in chosen]), tuple([self.doing[i] for i in chosen])
+        return People(ids, xy, heading, speed, doing, strides, pace)
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+@dataclass(frozen=True, slots=True)
+class Vehicles:
+    """Vehicles of a moment. xy (N, 2) m is the centre of the box; size (N, 2) m is length, width."""
+
+    ids: tuple[str, ...]
+    xy: Floats
+    heading: Floats
+    speed: Floats
+    size: Floats
+
+    @classmethod
+    def of(cls, ids: tuple[str, ...], xy: Any, heading: Any, speed: Any, size: Any) -> Vehicles:
+        n = len(ids)
+        return cls(
+            ids,
+            frozen(xy, shape=(n, 2)),
+            frozen(heading, shape=(n,)),
+            frozen(speed, shape=(n,)),
+            frozen(size, shape=(n, 2)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+NOBODY = People.of((), [], [], [], ())
+NO_VEHICLES = Vehicles.of((), [], [], [], [])
+
+
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """A crosswalk signal: may one walk, and in how many seconds does that change (None: unknown or never)."""
+
+    walk: bool
+    changes_in_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Street:
+    """Everything that moves or changes but the robot, at one tick.
+
+    signals: crossing id -> Signal, for the signalised crossings near the robot; a crossing that is absent has
+    no signal.
+    """
+
+    tick: int
+    people: People = NOBODY
+    vehicles: Vehicles = NO_VEHICLES
+    signals: Mapping[str, Signal] = field(default_factory=lambda: MappingProxyType({}))
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """What the robot is told: forward speed in m/s and yaw rate in rad/s, left positive."""
+
+    v_mps: float
+    w_radps: float
+
+
+STILL = Command(0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Contact:
+    """The robot's body touched something. other: the thing's id; substep: of the tick, from 0."""
+
+    kind: Literal["pedestrian", "vehicle", "wall", "object"]
+    other: str
+    substep: int
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """What one tick of physics did.
+
+    trace: (substeps, 3) x, y, heading of the robot after each substep. contacts: in order of substeps, at most
+    one for each (substep, other).
+    """
+
+    robot: RobotState
+    trace: Floats
+    contacts: tuple[Contact, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What a camera saw. rgb (H, W, 3) uint8; labels (H, W) uint8 semantic ids; depth (H, W) float32 metres."""
+
+    rgb: NDArray[np.uint8]
+    labels: NDArray[np.uint8] | None = None
+    depth: NDArray[np.float32] | None = None
+
+
+LABELS: Mapping[str, int] = MappingProxyType(
+    {
+        "sky": 0, "road": 1, "sidewalk": 2, "crosswalk": 3, "curb": 4, "verge": 5, "ground": 6, "building": 7,
+        "barrier": 8, "prop": 9, "person": 10, "vehicle": 11, "signal": 12, "robot": 13,
+    }
+)  # fmt: skip
+"""Semantic ids of a camera's label picture."""

@@ -1,0 +1,157 @@
+"""A policy at arm's length: asked through one door, which lets nothing out but a command or a PolicyError.
+
+What a policy is given are copies of its own: whatever it writes into them, the simulation, the record and the referee
+do not see it. What it is, its manifest, is read once. Whatever it raises is its crash, SystemExit and
+KeyboardInterrupt included, and never the end of the process.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Literal, Protocol
+
+from cosim.core.clock import Clock
+from cosim.core.errors import PolicyError
+from cosim.core.geometry import Polyline
+from cosim.core.state import Command, People, RobotState, Signal, Vehicles
+from cosim.episode.control import Limits, command_of
+from cosim.episode.ports import Manifest, Observation, Policy, Privileged
+
+Doing = Literal["loading", "reset", "first act", "act"]
+"""What a policy is busy with. The first answer of an episode may take longer than the others."""
+
+MOST_SAID = 500
+"""Of what a policy says when it raises, so many characters are kept."""
+
+
+class Timer(Protocol):
+    """Is told when a policy is asked and when it has answered."""
+
+    def starts(self, doing: Doing, tick: int) -> None: ...
+
+    def stops(self) -> None: ...
+
+
+class Untimed:
+    """A timer that does not care."""
+
+    def starts(self, doing: Doing, tick: int) -> None:
+        """Nothing to start."""
+
+    def stops(self) -> None:
+        """Nothing to stop."""
+
+
+class Driver:
+    """A policy that can be asked. It is a Policy itself, and its answers are commands within the robot's limits.
+
+    manifest: what the policy is, read once; later changes of `policy.manifest` mean nothing.
+    source_hash: of the file it is written in, "" where that is unknown (`cosim.policies.load`).
+    """
+
+    def __init__(
+        self,
+        policy: Policy,
+        manifest: Manifest | None = None,
+        source_hash: str = "",
+        timer: Timer | None = None,
+        limits: Limits = Limits(),  # noqa: B008  a frozen value
+    ) -> None:
+        self.manifest = policy.manifest if manifest is None else manifest
+        self.source_hash = source_hash
+        self._policy, self._limits = policy, limits
+        self._timer: Timer = Untimed() if timer is None else timer
+        self._answered = False
+        self._route: tuple[Polyline, Polyline] | None = None
+
+    @classmethod
+    def of(cls, policy: Policy) -> Driver:
+        """The driver of a policy: itself if it is one."""
+        return policy if isinstance(policy, Driver) else cls(policy)
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Tell the policy that an episode begins. Raises PolicyError for whatever it raises."""
+        self._answered, self._route = False, None
+        with self._asked("reset", 0):
+            self._policy.reset(scenario_id, seed)
+
+    def act(self, observation: Observation) -> Command:
+        """The policy's command. Raises PolicyError for whatever it raises, and for an answer that is no command."""
+        own = self._own(observation)
+        with self._asked("act" if self._answered else "first act", observation.tick):
+            answer = self._policy.act(own)
+            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, limits=self._limits)
+        self._answered = True
+        return command
+
+    @contextmanager
+    def _asked(self, doing: Doing, tick: int) -> Iterator[None]:
+        """The policy at work: timed, and whatever it raises is a PolicyError."""
+        process = os.getpid()
+        self._timer.starts(doing, tick)
+        try:
+            yield
+        except BaseException as error:
+            if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+                raise  # somebody pressed Ctrl-C; where that is ignored only a policy can have raised it
+            raise PolicyError(f"policy '{self.manifest.name}' {told_of(error)} ({when(doing, tick)})") from error
+        finally:
+            if os.getpid() != process:
+                os._exit(1)  # a child that the policy has forked: the episode goes on in its parent alone
+            self._timer.stops()
+
+    def _own(self, observation: Observation) -> Observation:
+        """What the policy may know, as copies of its own."""
+        rgb, known = observation.rgb, observation.privileged
+        return replace(
+            observation,
+            rgb=None if rgb is None else rgb.copy(),
+            privileged=self._own_knowledge(known) if known is not None and self.manifest.privileged else None,
+        )
+
+    def _own_knowledge(self, known: Privileged) -> Privileged:
+        """Copies of all but `free`, which cannot be written to; of the route one for the whole episode."""
+        if self._route is None or self._route[0] is not known.route:
+            self._route = (known.route, Polyline(known.route.points.copy()))
+        robot = known.robot
+        people, vehicles = known.people, known.vehicles
+        return Privileged(
+            robot=RobotState(robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad),
+            route=self._route[1],
+            route_s_m=known.route_s_m,
+            people=People.of(
+                people.ids, people.xy, people.heading, people.speed, people.doing, people.strides, people.pace
+            ),
+            vehicles=Vehicles.of(vehicles.ids, vehicles.xy, vehicles.heading, vehicles.speed, vehicles.size),
+            signals={name: Signal(signal.walk, signal.changes_in_s) for name, signal in known.signals.items()},
+            crossings=known.crossings,
+            free=known.free,
+        )
+
+
+def when(doing: Doing, tick: int) -> str:
+    """What a policy was doing, in words: "reset", or "act at 3.2 s"."""
+    return f"act at {Clock().time_s(tick):.2f} s" if doing.endswith("act") else doing
+
+
+def told_of(error: BaseException) -> str:
+    """What is said of an error that came out of a policy."""
+    said = said_by(error)
+    if isinstance(error, PolicyError):  # of this project: about its answer
+        return said
+    return f"raised {type(error).__name__}" + (f": {said}" if said else "")
+
+
+def said_by(error: BaseException) -> str:
+    """The message of an error, as text that can be stored and shown in a line or a few, however odd it is."""
+    try:
+        text = str(error)
+    except BaseException:  # noqa: BLE001  even the message of an error can raise
+        return "(its message cannot be read)"
+    text = text.encode("utf-8", "replace").decode()
+    text = "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]} ... ({len(text)} characters)"

@@ -1,0 +1,169 @@
+"""What the loop needs of the engines and of a policy: protocols of a few methods each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from shapely.geometry import MultiPolygon, Polygon
+
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
+from cosim.spec.events import EventQuery, EventReply
+
+
+@dataclass(frozen=True, slots=True)
+class Lens:
+    """What a camera's optics and sensor do to a picture; the default does nothing.
+
+    k1, k2: radial terms of Brown's distortion, in units of the focal length; k1 < 0 is a barrel.
+    shutter_s: time the shutter is open, the source of motion blur; readout_s: from the first row to the last, the
+    source of a rolling shutter's skew. full_well_e: electrons of a white pixel, 0 for a sensor without noise;
+    read_noise_e: electrons of noise in the dark. auto_exposure_ev: stops by which metering on the picture itself may
+    brighten or darken it. vignette: 0 (none) to 1 (the natural fall of light, cos^4 of the angle off the axis).
+    """
+
+    k1: float = 0.0
+    k2: float = 0.0
+    shutter_s: float = 0.0
+    readout_s: float = 0.0
+    full_well_e: float = 0.0
+    read_noise_e: float = 0.0
+    auto_exposure_ev: float = 0.0
+    vignette: float = 0.0
+
+    def __post_init__(self) -> None:
+        ranges = {
+            "k1": (-0.5, 0.5), "k2": (-0.5, 0.5), "shutter_s": (0.0, 0.1), "readout_s": (0.0, 0.1),
+            "full_well_e": (0.0, 1e6), "read_noise_e": (0.0, 1000.0), "auto_exposure_ev": (0.0, 4.0),
+            "vignette": (0.0, 1.0),
+        }  # fmt: skip
+        for field, (low, high) in ranges.items():
+            if not low <= getattr(self, field) <= high:
+                raise SpecError(f"lens {field} must be in [{low:g}, {high:g}], not {getattr(self, field)}")
+        if self.read_noise_e and not self.full_well_e:
+            raise SpecError("lens read_noise_e needs full_well_e, the electrons of a white pixel (10000 is usual)")
+
+
+@dataclass(frozen=True, slots=True)
+class CameraSpec:
+    """A policy's camera: size in pixels, vertical field of view in degrees, mount on the robot's base frame."""
+
+    width: int = 96
+    height: int = 96
+    fov_deg: float = 75.0
+    mount_m: tuple[float, float, float] = (0.30, 0.0, 0.62)
+    pitch_down_deg: float = 10.0
+    lens: Lens = Lens()
+
+
+@dataclass(frozen=True, slots=True)
+class Privileged:
+    """What the simulator knows and a camera does not; given only to policies that declare it.
+
+    route_s_m: the robot's arc length on the route. crossings: for each crossing of the route its id and the arc
+    lengths at which the route enters and leaves it. free: where the base centre may be with half the robot's width
+    to spare: the walkable area minus barriers, eroded.
+    """
+
+    robot: RobotState
+    route: Polyline
+    route_s_m: float
+    people: People
+    vehicles: Vehicles
+    signals: Mapping[str, Signal]
+    crossings: tuple[tuple[str, float, float], ...]
+    free: Polygon | MultiPolygon
+
+
+@dataclass(frozen=True, slots=True)
+class Observation:
+    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds."""
+
+    tick: int
+    time_s: float
+    rgb: NDArray[np.uint8] | None
+    v_mps: float
+    w_radps: float
+    privileged: Privileged | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Manifest:
+    """What a policy says of itself. rate_hz: how often it acts; waypoint_dt_s: time between its waypoints."""
+
+    name: str
+    version: str = "1"
+    rate_hz: float = 4.0
+    camera: CameraSpec | None = CameraSpec()
+    privileged: bool = False
+    waypoint_dt_s: float = 0.25
+
+
+class Policy(Protocol):
+    """A navigation policy. One object lives through many episodes; `reset` comes before each."""
+
+    @property
+    def manifest(self) -> Manifest: ...
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """A new episode begins. Anything random must come from `seed`."""
+
+    def act(self, observation: Observation) -> Command | NDArray[np.floating]:
+        """A command, or waypoints (N, 2): x forward, y left, metres in the robot's frame."""
+
+
+class Crowd(Protocol):
+    """Everything that moves but the robot."""
+
+    @property
+    def street(self) -> Street:
+        """The street now."""
+
+    def step(self, robot: RobotState, reply: EventReply) -> Street:
+        """One tick on, with the robot and the event pedestrians where they are now."""
+
+
+class World(Protocol):
+    """The physics of the robot."""
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width of the robot."""
+
+    def place(self, pose: Pose) -> RobotState:
+        """Put the robot at rest at a pose."""
+
+    def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
+        """One tick of physics; people and vehicles move evenly from `before` to `after`."""
+
+
+class Camera(Protocol):
+    """Draws what the robot sees."""
+
+    def render(self, robot: RobotState, street: Street) -> Frame: ...
+
+
+class Eyes(Camera, Protocol):
+    """A camera that also draws for humans."""
+
+    def picture(
+        self,
+        eye_m: ArrayLike,
+        target_m: ArrayLike,
+        street: Street,
+        robot: RobotState | None = None,
+        size: tuple[int, int] = (640, 480),
+        fov_deg: float = 60.0,
+    ) -> Frame:
+        """A view from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
+
+
+class Director(Protocol):
+    """Moves the event pedestrians."""
+
+    def react(self, query: EventQuery) -> EventReply: ...

@@ -1,0 +1,285 @@
+"""The referee: contacts and poses of a Step -> failures, resets, the end of the episode.
+
+Rules (the paper leaves them open; each is a decision of this benchmark):
+
+- collision: the body touches anything but the ground, or its footprint overlaps a person's 0.3 m disk or a
+  vehicle's box, at any physics substep. One event per thing until they have been apart for 1 s (people and
+  vehicles: more than 0.1 m apart; walls and objects: without contact).
+- out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
+- freezing: for 10 s the robot was never 0.5 m away from where it was at their beginning; time of waiting before a
+  red crossing of the route does not count.
+- Signals are judged on the crossings of the reference route, by arc length.
+- One failure a tick: collision before out_of_lane before freezing.
+- Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2 s ends it well,
+  passing the pedestrian ends it badly.
+- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing nor
+  at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at least 1 m
+  beyond them.
+- The jump counts neither as travel nor as progress.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
+from cosim.core.state import PERSON_RADIUS_M, Contact, Signal
+from cosim.episode.step import Reset, Step
+from cosim.place.street_map import WalkableArea
+from cosim.spec.events import Event, EventState
+from cosim.spec.scenario import Scenario
+
+FREEZE_WINDOW_S = 10.0
+FREEZE_MOVE_M = 0.5
+APART_M = 0.1
+APART_S = 1.0
+WAYPOINT_STEP_M = 5.0
+FREE_OF_PEOPLE_M = 1.0
+FREE_OF_VEHICLES_M = 4.0
+SAME_PLACE_M = 10.0
+SAME_PLACE_FAILURES = 3
+BEYOND_M = 1.0
+RED_WAIT_M = 4.0
+"""A robot this close before a red crossing of its route waits lawfully."""
+STANDING_MPS = 0.05
+STOP_S = 2.0
+STOP_WITHIN_M = 3.0
+"""Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
+LEFT_M = 0.3
+"""A robot this far before a crossing has left it and may enter it anew."""
+
+FailureKind = Literal["collision", "out_of_lane", "freezing"]
+Fault = Literal["robot_at_fault", "pedestrian_at_fault", "shared"]
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """One counted failure. other: what was touched; fault: who moved into whom, for pedestrians."""
+
+    kind: FailureKind
+    tick: int
+    x_m: float
+    y_m: float
+    route_s_m: float
+    robot_speed_mps: float
+    other: str = ""
+    other_kind: str = ""
+    fault: Fault | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """What the referee says of one Step. red_light_entry: the crossing that was entered at red, if one was."""
+
+    failure: Failure | None = None
+    reset: Reset | None = None
+    ended: Literal["goal", "stop", "timeout", "failure"] | None = None
+    red_light_entry: str | None = None
+    waits_at_red: bool = False
+
+
+class Referee:
+    """Judges the Steps of one episode, in order. Memory: contacts under way, the freezing window, past failures."""
+
+    def __init__(self, scenario: Scenario, area: WalkableArea, footprint_m: tuple[float, float], clock: Clock) -> None:
+        self._scenario = scenario
+        self._area = area
+        self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
+        self._clock = clock
+        self._route = scenario.route_line
+        self._limit_ticks = clock.ticks(scenario.time_limit_s)
+        self._touching: dict[str, int] = {}
+        self._window: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
+        self._failed_at_s: list[float] = []
+        self._entered: set[str] = set()
+        self._stood_ticks = 0
+
+    def judge(self, step: Step) -> Verdict:
+        """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
+        waits = self._waits_at_red(step)
+        red = self._red_light_entry(step)
+        failure = self._collision(step) or self._out_of_lane(step) or self._freezing(step, waits)
+        if failure is None:
+            return Verdict(None, None, self._end(step), red, waits)
+        if self._scenario.ends_on_failure:
+            return Verdict(failure, None, "failure", red, waits)
+        if step.tick + 1 >= self._limit_ticks:
+            return Verdict(failure, None, "timeout", red, waits)
+        reset = self._reset(failure, step)
+        self._window.clear()
+        self._entered.clear()
+        return Verdict(failure, reset, None, red, waits)
+
+    def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
+        if self._scenario.ends_at == "stop":
+            return self._end_by_stop(step)
+        pose, goal = step.motion.robot.pose, self._scenario.goal
+        near = np.hypot(pose.x_m - goal[0], pose.y_m - goal[1]) <= self._scenario.goal_radius_m
+        if near and step.route_s_after_m >= self._route.length_m - 2 * self._scenario.goal_radius_m:
+            return "goal"
+        return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
+        """The episode of a gesturing pedestrian: over when the robot has stopped before it, or has passed it."""
+        robot = step.motion.robot
+        here = any(
+            state.phase == "acting" and stands_before(robot.pose, event, state)
+            for event, state in zip(self._scenario.events, step.events.states, strict=True)
+        )
+        self._stood_ticks = self._stood_ticks + 1 if here and abs(robot.v_mps) < STANDING_MPS else 0
+        if self._stood_ticks >= self._clock.ticks(STOP_S):
+            return "stop"
+        if all(step.route_s_after_m > event.route_s_m for event in self._scenario.events):
+            return "failure"
+        return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _collision(self, step: Step) -> Failure | None:
+        self._forget_the_parted(step)
+        first: Contact | None = None
+        for contact in step.motion.contacts:
+            if contact.other not in self._touching and first is None:
+                first = contact
+            self._touching[contact.other] = step.tick
+        if first is None:
+            return None
+        speed_mps = step.robot.v_mps
+        fault = fault_of(first.other, speed_mps, step) if first.kind == "pedestrian" else None
+        return self._failure("collision", step, first.other, first.kind, fault)
+
+    def _forget_the_parted(self, step: Step) -> None:
+        """A thing may collide anew once it has been away for a second."""
+        if not self._touching:
+            return
+        gaps, beside = person_gaps(step, self._half_m), vehicles_within(step, self._half_m, APART_M)
+        for other, last_tick in list(self._touching.items()):
+            if gaps.get(other, np.inf) <= APART_M or other in beside:
+                self._touching[other] = step.tick
+            elif (step.tick - last_tick) * self._clock.tick_s > APART_S:
+                del self._touching[other]
+
+    def _out_of_lane(self, step: Step) -> Failure | None:
+        pose = step.motion.robot.pose
+        if self._area.contains(pose.x_m, pose.y_m):
+            return None
+        return self._failure("out_of_lane", step)
+
+    def _freezing(self, step: Step, waits_at_red: bool) -> Failure | None:
+        if waits_at_red:
+            return None
+        self._window.append(step.motion.robot.pose[:2])
+        if len(self._window) < (self._window.maxlen or 0):
+            return None
+        track = np.array(self._window)
+        if np.hypot(*(track - track[0]).T).max() >= FREEZE_MOVE_M:
+            return None
+        return self._failure("freezing", step)
+
+    def _waits_at_red(self, step: Step) -> bool:
+        return any(
+            signal_is_red(crossing.id, step.street.signals)
+            and -RED_WAIT_M <= step.route_s_after_m - crossing.enter_s_m <= 0.0
+            for crossing in self._scenario.crossings
+        )
+
+    def _red_light_entry(self, step: Step) -> str | None:
+        for crossing in self._scenario.crossings:
+            inside = crossing.enter_s_m < step.route_s_after_m < crossing.leave_s_m
+            if inside and crossing.id not in self._entered:
+                self._entered.add(crossing.id)
+                if signal_is_red(crossing.id, step.street.signals):
+                    return crossing.id
+            elif step.route_s_after_m < crossing.enter_s_m - LEFT_M:
+                self._entered.discard(crossing.id)
+        return None
+
+    def _failure(
+        self, kind: FailureKind, step: Step, other: str = "", other_kind: str = "", fault: Fault | None = None
+    ) -> Failure:
+        pose = step.motion.robot.pose
+        speed = abs(step.robot.v_mps)
+        return Failure(kind, step.tick, pose.x_m, pose.y_m, step.route_s_after_m, speed, other, other_kind, fault)
+
+    def _reset(self, failure: Failure, step: Step) -> Reset:
+        self._failed_at_s.append(failure.route_s_m)
+        recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
+        stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= SAME_PLACE_M
+        count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
+        last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
+        waypoints = np.arange(count) * WAYPOINT_STEP_M
+        waypoints = waypoints[waypoints <= last_m]
+        if stuck:
+            self._failed_at_s.clear()
+            order = waypoints[waypoints > max(recent) + BEYOND_M]
+        else:
+            order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
+        for s_m in order:
+            pose = self._route.at(float(s_m))
+            if self._free(pose, float(s_m), step):
+                return Reset(pose, float(s_m))
+        s_m = float(waypoints[np.argmin(np.abs(waypoints - failure.route_s_m))])
+        return Reset(self._route.at(s_m), s_m)
+
+    def _free(self, pose: Pose, s_m: float, step: Step) -> bool:
+        if any(c.enter_s_m - self._half_m[0] < s_m < c.leave_s_m + self._half_m[0] for c in self._scenario.crossings):
+            return False
+        people, vehicles = step.street_after.people, step.street_after.vehicles
+        if len(people) and np.hypot(*(people.xy - pose.xy).T).min() < FREE_OF_PEOPLE_M:
+            return False
+        return not (len(vehicles) and np.hypot(*(vehicles.xy - pose.xy).T).min() < FREE_OF_VEHICLES_M)
+
+
+def stands_before(robot: Pose, event: Event, state: EventState) -> bool:
+    """Whether the robot is within STOP_WITHIN_M of somebody, on the side from which it came."""
+    for walker in state.walkers:
+        dx, dy = robot.x_m - walker.x_m, robot.y_m - walker.y_m
+        behind = dx * math.cos(event.heading_rad) + dy * math.sin(event.heading_rad) > 0.0
+        if not behind and math.hypot(dx, dy) <= STOP_WITHIN_M:
+            return True
+    return False
+
+
+def signal_is_red(crossing_id: str, signals: Mapping[str, Signal]) -> bool:
+    """Whether a crossing has a signal and it says stop."""
+    signal = signals.get(crossing_id)
+    return signal is not None and not signal.walk
+
+
+def person_gaps(step: Step, half_m: tuple[float, float]) -> dict[str, float]:
+    """Gap in metres from the robot's footprint to each person's disk at the end of a Step."""
+    people, pose = step.street_after.people, step.motion.robot.pose
+    if not len(people):
+        return {}
+    gaps: Floats = box_disk_gap(np.array([pose]), *half_m, people.xy[None])[0] - PERSON_RADIUS_M
+    return dict(zip(people.ids, gaps.tolist(), strict=True))
+
+
+def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> set[str]:
+    """Ids of the vehicles whose box comes within a gap of the robot's outline at the end of a Step."""
+    vehicles, pose = step.street_after.vehicles, step.motion.robot.pose
+    if not len(vehicles):
+        return set()
+    boxes = np.column_stack([vehicles.xy, vehicles.heading])
+    near = boxes_overlap(np.array(pose), np.array(half_m) + gap_m, boxes, vehicles.size / 2)
+    return {vehicles.ids[i] for i in np.flatnonzero(near)}
+
+
+def fault_of(person: str, robot_speed_mps: float, step: Step) -> Fault:
+    """Who moved into whom: a robot slower than 0.05 m/s was walked into; a standing person was driven into."""
+    if abs(robot_speed_mps) < STANDING_MPS:
+        return "pedestrian_at_fault"
+    people = step.street.people
+    if person in people.ids:
+        i = people.ids.index(person)
+        pose = step.robot.pose
+        to_robot = pose.xy - people.xy[i]
+        closing = people.speed[i] * np.cos(people.heading[i] - np.arctan2(to_robot[1], to_robot[0]))
+        if closing > STANDING_MPS:
+            return "shared"
+    return "robot_at_fault"

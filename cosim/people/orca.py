@@ -1,0 +1,150 @@
+"""Optimal reciprocal collision avoidance: velocities that keep a disk clear of others for a time.
+
+Source: J. van den Berg, S. J. Guy, M. Lin, D. Manocha, "Reciprocal n-body collision avoidance", Robotics Research (ISRR
+2009), Springer 2011; the names are its own. The linear programme is theirs too, after de Berg et al., "Computational
+Geometry", chapter 4 (linear programming).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from cosim.core.geometry import Floats
+
+EPS = 1e-9
+
+Vector = Floats | tuple[float, float]
+"""Two numbers: metres, or metres per second."""
+
+
+class HalfPlane(NamedTuple):
+    """Velocities v (m/s) with normal . v >= offset. normal: of length 1, into the permitted side."""
+
+    nx: float
+    ny: float
+    offset: float
+
+    def excess(self, v: Floats) -> float:
+        """How far inside (positive) or outside a velocity (2,) lies, in m/s."""
+        return self.nx * float(v[0]) + self.ny * float(v[1]) - self.offset
+
+
+def half_plane(
+    apart_m: Vector, mine_mps: Vector, other_mps: Vector, radius_m: float, horizon_s: float, share: float, step_s: float
+) -> HalfPlane:
+    """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the paper.
+
+    apart_m (2,): from me to the other; mine_mps, other_mps (2,): velocities; radius_m: sum of both radii; horizon_s:
+    tau; share: of the avoidance that is mine, 1/2 where both avoid, 1 where the other does not; step_s: time in which
+    disks that overlap already are to be parted.
+
+    The velocity obstacle VO^tau is the cone of relative velocities that lead into the disk of radius
+    `radius_m` at `apart_m` within tau: a disk at apart/tau of radius r/tau, and the legs that touch it. u is the
+    smallest change of the relative velocity that reaches the obstacle's boundary, n its outward normal there.
+    """
+    ax, ay = float(apart_m[0]), float(apart_m[1])
+    mx, my = float(mine_mps[0]), float(mine_mps[1])
+    rx, ry = mx - float(other_mps[0]), my - float(other_mps[1])
+    distance_m = math.hypot(ax, ay)
+    if distance_m <= radius_m:
+        horizon_s = step_s
+    wx, wy = rx - ax / horizon_s, ry - ay / horizon_s
+    along = wx * ax + wy * ay
+    before_disk = along < 0.0 and along**2 >= radius_m**2 * (wx * wx + wy * wy)
+    if distance_m <= radius_m or before_disk:
+        size = math.hypot(wx, wy)
+        far_m = max(distance_m, EPS)
+        nx, ny = (wx / size, wy / size) if size > EPS else (-ax / far_m, -ay / far_m)
+        inside = radius_m / horizon_s - (wx * nx + wy * ny)
+    else:
+        sin = radius_m / distance_m
+        cos = math.sqrt(1.0 - sin**2)
+        left = 1.0 if ax * ry - ay * rx >= 0.0 else -1.0
+        nx = (-left * cos * ay - sin * ax) / distance_m
+        ny = (left * cos * ax - sin * ay) / distance_m
+        inside = -(rx * nx + ry * ny)
+    return HalfPlane(nx, ny, (mx + share * inside * nx) * nx + (my + share * inside * ny) * ny)
+
+
+def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mps: float) -> Floats:
+    """The permitted velocity (2,) nearest to the preferred one, no faster than `fastest_mps`.
+
+    Where the half-planes leave none ("densely packed conditions"), the one that violates the worst of them least.
+    """
+    speed = math.hypot(*preferred_mps)
+    v = preferred_mps * min(1.0, fastest_mps / max(speed, EPS))
+    for i, plane in enumerate(planes):
+        if plane.excess(v) < -EPS:
+            found = _on_edge(plane, planes[:i], fastest_mps, preferred_mps, toward=False)
+            if found is None:
+                return _least_violating(planes, i, v, fastest_mps)
+            v = found
+    return v
+
+
+def _on_edge(
+    plane: HalfPlane, others: Sequence[HalfPlane], fastest_mps: float, goal: Floats, *, toward: bool
+) -> Floats | None:
+    """The best velocity on the edge of a half-plane that all others permit; None where they permit none.
+
+    goal: the velocity to be near to; or, with `toward`, the direction to go far in.
+    """
+    if abs(plane.offset) > fastest_mps:
+        return None
+    half = math.sqrt(fastest_mps**2 - plane.offset**2)
+    low, high = -half, half
+    dx, dy = plane.ny, -plane.nx
+    x0, y0 = plane.nx * plane.offset, plane.ny * plane.offset
+    for other in others:
+        gain = dx * other.nx + dy * other.ny
+        short = other.offset - (x0 * other.nx + y0 * other.ny)
+        if abs(gain) < EPS:
+            if short > EPS:
+                return None
+        elif gain > 0.0:
+            low = max(low, short / gain)
+        else:
+            high = min(high, short / gain)
+        if low > high:
+            return None
+    wanted = dx * float(goal[0]) + dy * float(goal[1])
+    if toward:
+        t = high if wanted > 0.0 else low
+    else:
+        t = min(max(wanted, low), high)
+    return np.array([x0 + t * dx, y0 + t * dy])
+
+
+def _least_violating(planes: Sequence[HalfPlane], first: int, v: Floats, fastest_mps: float) -> Floats:
+    """The velocity whose worst violation is least: half-planes move outward together until one velocity is permitted.
+
+    v permits the half-planes before `first`. Each half-plane that is violated more than all before it becomes the
+    worst; then its violation is made as small as it can be without any earlier one's becoming larger than it. "Not
+    larger than it" is a half-plane again: (n_j - n_i) . v >= c_j - c_i.
+    """
+    worst = 0.0
+    for i in range(first, len(planes)):
+        plane = planes[i]
+        if -plane.excess(v) <= worst + EPS:
+            continue
+        no_worse = [h for other in planes[:i] if (h := _no_worse(other, plane)) is not None]
+        toward = np.array([plane.nx, plane.ny])
+        found: Floats | None = toward * fastest_mps
+        for k, bound in enumerate(no_worse):
+            if found is not None and bound.excess(found) < -EPS:
+                found = _on_edge(bound, no_worse[:k], fastest_mps, toward, toward=True)
+        if found is not None:
+            v = found
+        worst = -plane.excess(v)
+    return v
+
+
+def _no_worse(other: HalfPlane, plane: HalfPlane) -> HalfPlane | None:
+    """Where `other` is violated no more than `plane`; None for parallel ones, where one bounds the other everywhere."""
+    nx, ny = other.nx - plane.nx, other.ny - plane.ny
+    size = math.hypot(nx, ny)
+    return None if size < 1e-7 else HalfPlane(nx / size, ny / size, (other.offset - plane.offset) / size)

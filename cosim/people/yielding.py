@@ -1,0 +1,98 @@
+"""Nobody walks into the robot: how a person steps round it.
+
+SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; our own
+people see other people (`cosim.people.steering`), the robot they see here. A person goes where it wants to go, but slides
+round the robot's outline instead of entering it. Only the person's own motion is changed: a robot that drives at
+somebody still hits them.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats, Pose
+from cosim.core.state import PERSON_RADIUS_M
+
+KEEP_M = 0.12
+"""Gap between a person's disk and the robot's outline at which the person begins to step round."""
+
+DRAWS_BACK_M = 0.015
+"""Who stands nearer to the robot than KEEP_M goes back by this in a step of 0.05 s."""
+
+TOUCH_M = 0.01
+FORESEEN_S = 0.6
+"""How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
+
+
+class Body(NamedTuple):
+    """The robot as people see it: its pose, half its length and width in metres, its speed."""
+
+    pose: Pose
+    half_m: tuple[float, float]
+    v_mps: float = 0.0
+
+
+def within_reach_m(body: Body) -> float:
+    """How near to the robot's middle somebody must be for a step to be led round it."""
+    return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + KEEP_M
+
+
+def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.bool_] | None = None) -> Floats:
+    """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
+
+    People keep out of the ground that a moving robot is about to cover, too: who walks against it there steps aside.
+    Apart from that a step towards the robot from nearer than KEEP_M loses its
+    inward part; its length goes into the way round: to the side on which the step would pass the robot's centre.
+    That choice strengthens itself, so nobody dithers. stand (N,): who only wants to stand there comes up as near as it
+    can and draws back slowly from a robot that is nearer than KEEP_M: it would go round it and back for ever.
+    """
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    length, width = body.half_m
+    ahead = FORESEEN_S * max(body.v_mps, 0.0)
+    low, high = np.array([-length, -width]), np.array([length, width])
+    reach = np.array([ahead, 0.0])
+    near = (wanted - body.pose.xy) @ turn
+    if not (_gap(near, low, high + reach) < KEEP_M).any():
+        return wanted
+    local = (before - body.pose.xy) @ turn
+    step = near - local
+    pace = np.hypot(step[:, 0], step[:, 1])
+    side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
+
+    out = local - np.clip(local, low, high)
+    far = np.hypot(out[:, 0], out[:, 1])
+    normal = out / np.maximum(far, 1e-9)[:, None]
+    inward = -(step * normal).sum(axis=1)
+    tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
+    slides = (_gap(near, low, high) < KEEP_M) & (inward > 0.0) & (far > 1e-6)
+    moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
+    if stand is not None:
+        back = np.clip(KEEP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
+        comes_up = slides & stand
+        moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
+
+    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < KEEP_M)
+    aside = np.where(local[:, 1] >= 0.0, pace, -pace)
+    moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
+    rounded: Floats = moved @ turn.T + body.pose.xy
+    return rounded
+
+
+def touches(xy: Floats, body: Body, within_m: float = TOUCH_M) -> bool:
+    """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    local = (np.asarray(xy) - body.pose.xy)[None] @ np.array([[cos, -sin], [sin, cos]])
+    half = np.array(body.half_m)
+    return bool(_gap(local, -half, half)[0] <= within_m)
+
+
+def _gap(points: Floats, low: Floats, high: Floats) -> Floats:
+    """Distance from people's disks to a box that is square to the axes, (N,) metres."""
+    away = points - np.clip(points, low, high)
+    gap: Floats = np.hypot(away[:, 0], away[:, 1]) - PERSON_RADIUS_M
+    return gap

@@ -1,0 +1,341 @@
+"""What a place is worth: its size, what can be walked, what is wrong with it, which scenarios it can hold."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import msgspec
+import numpy as np
+import shapely
+
+from cosim.core.geometry import Floats, Polyline
+from cosim.place import overlay
+from cosim.place.street_map import Lane, Port, StreetMap, Strip
+from cosim.place.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
+from cosim.place.walk_graph import WalkGraph
+
+NARROW_M = 1.0
+"""On a strip less wide than this a robot and a person cannot pass."""
+STUB_M = 1.0
+STEEP = 0.08
+"""Grade from which a walkable lane counts as steep."""
+MOSTLY = 0.5
+START_M = 30.0
+"""Routes start and end on sidewalks at least this long."""
+UNIT_WIDE_M = 1.5
+ROUTE_M = (120.0, 560.0)
+"""Shortest and longest way of a long-horizon route."""
+PROBES = 24
+
+
+class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
+    """What a SUMO net says beyond its StreetMap. Ids are SUMO edge ids, signals' ids of traffic lights.
+
+    mixed_km: lanes that people share with cars, which are not walkable here. elevation_m: lowest and highest point,
+    None for a flat net. steep, false_grades: counts of walkable lanes. no_program: signals named by crossings that
+    have no program (SUMO runs level crossings itself). levels: walkable edges on bridges or in tunnels.
+    """
+
+    version: str
+    projected: bool
+    left_hand: bool
+    edges: int
+    pavement_km: float
+    shared_km: float
+    mixed_km: float
+    areas: int
+    crossings: int
+    twisted_areas: int
+    widths_missing: int
+    signals: int
+    never_green: tuple[str, ...]
+    always_green: tuple[str, ...]
+    misfits: tuple[str, ...]
+    no_program: tuple[str, ...]
+    elevation_m: tuple[float, float] | None
+    steep: int
+    false_grades: int
+    levels: tuple[str, ...]
+    levels_km: float
+
+    @property
+    def walkable_km(self) -> float:
+        """Every lane on which SUMO lets people walk beside or off the carriageway, and those shared with cars."""
+        return self.pavement_km + self.shared_km + self.mixed_km
+
+
+class Island(msgspec.Struct, frozen=True):
+    """A connected part of the walkable strips; share: of the length of all of them."""
+
+    strips: int
+    km: float
+    share: float
+
+
+class Problem(msgspec.Struct, frozen=True):
+    """Something wrong at one strip.
+
+    kind: island, narrow, on_road, stacked, steep, never_green, always_green, level or misfit.
+    """
+
+    kind: str
+    strip: str
+    x_m: float
+    y_m: float
+
+
+class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
+    """What was found. reasons: why the map cannot be used, none when it can; notes: what a user should know.
+
+    walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the sidewalks' area that
+    lies on lanes of roads; on_road: sidewalks that do so mostly; stacked: those that cross a road where there is no
+    crossing. guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
+    features: how many buildings and things of each kind the map itself shows.
+    """
+
+    name: str
+    size_m: tuple[float, float]
+    walkable_km: float
+    crossing_km: float
+    sidewalks: int
+    crossings: int
+    signalised: int
+    corners: int
+    roads_km: float
+    left_hand: bool
+    islands: tuple[Island, ...]
+    narrow: int
+    narrow_km: float
+    narrowest_m: float
+    stubs: int
+    dead_ends: int
+    overlap_share: float
+    on_road: int
+    stacked: int
+    guessed_share: float | None
+    elevation: Elevation | None
+    facts: NetFacts | None
+    unit_possible: bool
+    long_horizon_possible: bool
+    reasons: tuple[str, ...]
+    notes: tuple[str, ...]
+    problems: tuple[Problem, ...]
+    features: dict[str, int]
+
+    @property
+    def usable(self) -> bool:
+        return not self.reasons
+
+
+def check_map(
+    street_map: StreetMap,
+    graph: WalkGraph | None = None,
+    facts: NetFacts | None = None,
+    guessed_share: float | None = None,
+) -> MapCheck:
+    """Everything that can be said of a place without simulating it. graph: the place's own, made here when None."""
+    graph = WalkGraph(street_map) if graph is None else graph
+    strips = list(street_map.strips.values())
+    sidewalks = [s for s in strips if s.kind == "sidewalk"]
+    crossings = [s for s in strips if s.kind == "crossing"]
+    lengths = {s.id: s.length_m for s in strips}
+    share = on_road_shares(street_map, sidewalks)
+    areas = np.array([s.polygon.area for s in sidewalks])
+    on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY]
+    stacked = [s for s in stacked_on_roads(street_map, sidewalks) if s not in on_road]
+    narrow = [s for s in sidewalks if s.width_m < NARROW_M]
+    unit = _unit_reasons(street_map, graph, lengths)
+    long_horizon = _long_horizon_reasons(street_map, graph, lengths)
+    reasons = _unusable(street_map, unit, long_horizon)
+    marked = [
+        *_marks("island", [s for s in strips if s.id not in graph.main_strips]),
+        *_marks("narrow", narrow),
+        *_marks("on_road", on_road),
+        *_marks("stacked", stacked),
+        *_marks("steep", [s for s in strips if s.id in street_map.steep]),
+    ]
+    if facts is not None:
+        for kind in ("never_green", "always_green", "levels", "misfits"):
+            known = [street_map.strips[i] for i in getattr(facts, kind) if i in street_map.strips]
+            marked += _marks(kind.removesuffix("s"), known)
+    x0, y0, x1, y1 = street_map.bounds
+    return MapCheck(
+        name=street_map.name,
+        size_m=(x1 - x0, y1 - y0),
+        walkable_km=sum(lengths[s.id] for s in sidewalks) / 1000.0,
+        crossing_km=sum(lengths[s.id] for s in crossings) / 1000.0,
+        sidewalks=len(sidewalks),
+        crossings=len(crossings),
+        signalised=sum(s.signalised for s in crossings),
+        corners=len(street_map.corners),
+        roads_km=sum(_length_m(lane) for lane in street_map.lanes.values() if _is_road(lane)) / 1000.0,
+        left_hand=street_map.left_hand,
+        islands=_islands(graph, lengths),
+        narrow=len(narrow),
+        narrow_km=sum(lengths[s.id] for s in narrow) / 1000.0,
+        narrowest_m=min((s.width_m for s in sidewalks), default=0.0),
+        stubs=sum(lengths[s.id] < STUB_M for s in strips),
+        dead_ends=sum(corner is None for s in strips for corner in s.corners),
+        overlap_share=float((share * areas).sum() / areas.sum()) if areas.sum() > 0.0 else 0.0,
+        on_road=len(on_road),
+        stacked=len(stacked),
+        guessed_share=guessed_share,
+        elevation=street_map.elevation,
+        facts=facts,
+        unit_possible=not unit,
+        long_horizon_possible=not long_horizon,
+        reasons=tuple(reasons),
+        notes=(
+            *(() if reasons else (*unit, *long_horizon)),
+            *_land_notes(street_map),
+            *_stairs(sidewalks),
+            *_notes(facts),
+        ),
+        problems=tuple(marked),
+        features=dict(sorted(Counter(feature.kind for feature in street_map.features).items())),
+    )
+
+
+def on_road_shares(street_map: StreetMap, sidewalks: Sequence[Strip]) -> Floats:
+    """(N,) how much of each sidewalk's area lies on lanes that are driven on, junctions' interiors apart; 0 to 1."""
+    roads = [lane.polygon for lane in street_map.lanes.values() if _is_road(lane)]
+    if not roads or not sidewalks:
+        return np.zeros(len(sidewalks))
+    polygons = np.array([s.polygon for s in sidewalks], dtype=object)
+    tree = shapely.STRtree(roads)
+    strip, lane = tree.query(polygons, predicate="intersects")
+    both = shapely.area(overlay.intersection(polygons[strip], tree.geometries[lane]))
+    covered = np.bincount(strip, weights=both, minlength=len(sidewalks))
+    return np.minimum(covered / np.maximum(shapely.area(polygons), 1e-9), 1.0)
+
+
+def stacked_on_roads(street_map: StreetMap, sidewalks: Sequence[Strip]) -> list[Strip]:
+    """Sidewalks whose middle line crosses that of a lane of another edge: bridges, tunnels, or maps gone wrong."""
+    roads = [lane for lane in street_map.lanes.values() if _is_road(lane)]
+    if not roads or not sidewalks:
+        return []
+    tree = shapely.STRtree([shapely.LineString(lane.line[:, :2]) for lane in roads])
+    lines = [shapely.LineString(s.line[:, :2]) for s in sidewalks]
+    pairs = zip(*tree.query(lines, predicate="crosses"), strict=True)
+    hit = {int(i) for i, k in pairs if roads[k].edge != sidewalks[i].id}
+    return [sidewalks[i] for i in sorted(hit)]
+
+
+def _is_road(lane: Lane) -> bool:
+    return lane.kind == "road" and not lane.internal
+
+
+def _length_m(lane: Lane) -> float:
+    return float(np.hypot(*np.diff(lane.line[:, :2], axis=0).T).sum())
+
+
+def _marks(kind: str, strips: Sequence[Strip]) -> list[Problem]:
+    middles = [(s, Polyline(s.line[:, :2]).at(s.length_m / 2.0)) for s in strips if s.length_m > 0.0]
+    return [Problem(kind, s.id, round(at.x_m, 2), round(at.y_m, 2)) for s, at in middles]
+
+
+def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
+    """The connected parts, longest first."""
+    labels = graph.component[::2]
+    if not len(labels):
+        return ()
+    metres = np.bincount(labels, weights=[lengths[s] for s in graph.street_map.strips])
+    counts = np.bincount(labels)
+    total = max(float(metres.sum()), 1e-9)
+    order = np.argsort(-metres, kind="stable")
+    return tuple(Island(int(counts[i]), float(metres[i]) / 1000.0, float(metres[i]) / total) for i in order)
+
+
+def _starts(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[Strip]:
+    return [
+        s
+        for s in street_map.strips.values()
+        if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= NARROW_M
+        if s.id not in street_map.steep
+    ]
+
+
+def _unit_reasons(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[str]:
+    if not any(s.width_m >= UNIT_WIDE_M for s in _starts(street_map, graph, lengths)):
+        return [f"no unit scenarios: no connected sidewalk is {START_M:g} m long and {UNIT_WIDE_M:g} m wide"]
+    if not any(street_map.strips[s].kind == "crossing" for s in graph.main_strips):
+        return ["no unit scenarios: the longest island has no crossing"]
+    return []
+
+
+def _long_horizon_reasons(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[str]:
+    starts = _starts(street_map, graph, lengths)
+    ends = {s.id for s in starts}
+    for start in starts[:: max(1, len(starts) // PROBES)]:
+        for end in (0, 1):
+            leave = Port(start.id, 1 if end else 0)
+            reach = graph.reach(leave, street_map.too_steep | {leave.other}, limit_m=ROUTE_M[1])
+            for goal in reach.within(*ROUTE_M):
+                way = reach.path(goal) if goal.strip in ends else None
+                if way and any(street_map.strips[port.strip].kind == "crossing" for port in way):
+                    return []
+    low, high = ROUTE_M
+    return [f"no long-horizon scenarios: no way of {low:g} to {high:g} m over a crossing joins two long sidewalks"]
+
+
+def _unusable(street_map: StreetMap, unit: list[str], long_horizon: list[str]) -> list[str]:
+    if not street_map.strips:
+        return ["nothing is walkable: no sidewalk, path or crossing"]
+    if not street_map.corners:
+        return ["its sidewalks are not connected: the net has no walking areas; import it with --upgrade"]
+    return [*unit, *long_horizon] if unit and long_horizon else []
+
+
+def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
+    steps = [s.id for s in sidewalks if s.going == "steps"]
+    return [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"] if steps else []
+
+
+def _notes(facts: NetFacts | None) -> list[str]:
+    if facts is None:
+        return []
+    notes = []
+    if facts.mixed_km >= 0.01:
+        notes.append(f"{facts.mixed_km:.2f} km that people share with cars are not walkable here")
+    if facts.levels:
+        notes.append(
+            f"{len(facts.levels)} walkable edges ({facts.levels_km:.2f} km) are on bridges or in tunnels: they lie "
+            "level with the streets they pass over or under; routes keep off them"
+        )
+    if facts.widths_missing:
+        notes.append(f"{facts.widths_missing} walkable lanes name no width: SUMO's default of 3.2 m holds")
+    if facts.no_program:
+        notes.append(f"{len(facts.no_program)} level crossings are run by SUMO itself: {_some(facts.no_program)}")
+    for which, words in (("never_green", "never green"), ("always_green", "always green")):
+        found: tuple[str, ...] = getattr(facts, which)
+        if found:
+            notes.append(f"{len(found)} signalised crossings are {words}: {_some(found)}")
+    if facts.misfits:
+        notes.append(f"{len(facts.misfits)} crossings are beyond their signal's program: {_some(facts.misfits)}")
+    return notes
+
+
+def _land_notes(street_map: StreetMap) -> list[str]:
+    elevation = street_map.elevation
+    if elevation is None:
+        return []
+    span = f"elevation {round(elevation.low_m)} to {round(elevation.high_m)} m"
+    if elevation.dropped:
+        return [f"{span} is dropped, the ground is flat: {elevation.dropped}"]
+    notes = [
+        f"{span} is kept; {elevation.missing} of {elevation.points} points had none or a false one and were "
+        f"interpolated; {elevation.clamped} places on streets were moved, by up to {elevation.moved_m:.1f} m, so that "
+        f"no street or walkway rises more than {WALK_GRADE_MAX:.0%} along its line"
+    ]
+    if elevation.steep:
+        km = sum(street_map.strips[strip].length_m for strip in elevation.steep) / 1000.0
+        notes.append(
+            f"{len(elevation.steep)} walkways ({km:.1f} km) are steeper than {ROBOT_GRADE_MAX:.0%} somewhere (steps, "
+            "hill paths, terraces closer together than heights can show): no robot is sent over them"
+        )
+    return notes
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:4]) + (" ..." if len(names) > 4 else "")

@@ -1,0 +1,185 @@
+"""WalkGraph: where one can walk on, from strip to strip, and how far it is.
+
+Nodes are ports, the two ends of every strip. Arcs lead along each strip (its length) and, at each corner, between
+every two of its ports (the straight line). A closed port is one that a barrier stops: nobody passes between it and
+its corner, but the strip behind it stays walkable from its other end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
+
+from cosim.core.errors import MapError
+from cosim.core.geometry import Floats
+from cosim.place.street_map import Port, StreetMap
+
+OPEN: frozenset[Port] = frozenset()
+"""No port is closed."""
+
+SHORTEST_HOP_M = 0.1
+"""Length of a step across a corner between ports that touch."""
+
+CROSSING_WEIGHT = 0.5
+"""How likely a wanderer takes a crossing, relative to a sidewalk."""
+
+
+@dataclass(frozen=True, slots=True)
+class Reach:
+    """Everything that can be walked to from `start`.
+
+    distance_m: (P,) metres to each port of the graph, inf where it is out of reach or beyond the limit.
+    """
+
+    start: Port
+    ports: tuple[Port, ...]
+    distance_m: Floats
+    _index: dict[str, int]
+    _before: NDArray[np.int32]
+
+    def within(self, low_m: float, high_m: float) -> list[Port]:
+        """The ports at a walking distance in [low_m, high_m], in the graph's order."""
+        hits = np.flatnonzero((self.distance_m >= low_m) & (self.distance_m <= high_m))
+        return [self.ports[i] for i in hits]
+
+    def to(self, goal: Port) -> float:
+        """Walking distance to `goal` in metres, inf when out of reach."""
+        return float(self.distance_m[_number(self._index, goal)])
+
+    def path(self, goal: Port) -> list[Port] | None:
+        """The shortest way to `goal`, both ends included, or None when out of reach."""
+        node = _number(self._index, goal)
+        if not np.isfinite(self.distance_m[node]):
+            return None
+        nodes = [node]
+        while (node := int(self._before[node])) >= 0:
+            nodes.append(node)
+        return [self.ports[i] for i in reversed(nodes)]
+
+
+class WalkGraph:
+    """The walking graph of a place.
+
+    ports: all P of them, both ends of each strip in the map's order. xy: (P, 2) metres. component: (P,) label of
+    the connected part each port lies in, when nothing is closed. main_strips: the strips of the longest such part.
+    """
+
+    def __init__(self, street_map: StreetMap) -> None:
+        self.street_map = street_map
+        self.ports: tuple[Port, ...] = tuple(p for s in street_map.strips for p in (Port(s, 0), Port(s, 1)))
+        self._index = {strip: 2 * i for i, strip in enumerate(street_map.strips)}
+        strips = list(street_map.strips.values())
+        ends = [strip.line[i, :2] for strip in strips for i in (0, -1)]
+        self.xy: Floats = np.array(ends, dtype=float).reshape(-1, 2)
+        self.xy.flags.writeable = False
+        self._corner: dict[Port, tuple[Port, ...]] = {
+            port: tuple(other for other in corner.ports if other != port)
+            for corner in street_map.corners.values()
+            for port in corner.ports
+        }
+        self._hops = self._corner_arcs()
+        lengths = np.array([max(strip.length_m, SHORTEST_HOP_M) for strip in strips])
+        even = 2 * np.arange(len(strips), dtype=np.int32)
+        self._along = (np.concatenate([even, even + 1]), np.concatenate([even + 1, even]), np.tile(lengths, 2))
+        self._arcs = lru_cache(maxsize=8)(self._arcs_without)
+        _, labels = connected_components(self._arcs(OPEN), directed=False)
+        self.component: NDArray[np.int32] = labels
+        totals = np.bincount(labels[::2], weights=lengths) if strips else np.zeros(1)
+        main = int(np.argmax(totals))
+        self.main_strips: frozenset[str] = frozenset(
+            s.id for s, c in zip(strips, labels[::2], strict=True) if c == main
+        )
+
+    def point(self, port: Port) -> tuple[float, float]:
+        """Where a port is, in metres."""
+        x, y = self.xy[_number(self._index, port)]
+        return float(x), float(y)
+
+    def others(self, port: Port, closed: frozenset[Port] = OPEN) -> tuple[Port, ...]:
+        """The ports that can be reached across the corner at `port`; none at a dead end or a closed port."""
+        if port in closed:
+            return ()
+        around = self._corner.get(port, ())
+        return tuple(other for other in around if other not in closed) if closed else around
+
+    def shortest(self, start: Port, goal: Port, closed: frozenset[Port] = OPEN) -> tuple[list[Port], float] | None:
+        """The shortest way from port to port, both included, and its length in metres; None if there is none."""
+        reach = self.reach(start, closed)
+        path = reach.path(goal)
+        return None if path is None else (path, reach.to(goal))
+
+    def reach(self, start: Port, closed: frozenset[Port] = OPEN, limit_m: float = math.inf) -> Reach:
+        """Distances from `start` to every port within `limit_m`."""
+        distance, before = dijkstra(  # type: ignore[call-overload]
+            self._arcs(closed), indices=_number(self._index, start), return_predecessors=True, limit=limit_m
+        )
+        return Reach(start, self.ports, distance, self._index, before)
+
+    def wander(
+        self, rng: np.random.Generator, strip: str, forward: bool, n_edges: int, closed: frozenset[Port] = OPEN
+    ) -> list[str]:
+        """A random walk: up to `n_edges` strip ids from `strip` on, crossings named, never past a closed port.
+
+        forward: whether `strip` is walked along its line. It keeps out of strips without a way out and does not
+        end on a crossing, so it can be shorter, down to `strip` alone.
+        """
+        strips = self.street_map.strips
+        walk = [strip]
+        port = Port(strip, 1 if forward else 0)
+        while len(walk) < n_edges:
+            choices = [p for p in self.others(port, closed) if self.others(p.other, closed)]
+            if not choices:
+                break
+            weights = [CROSSING_WEIGHT if strips[p.strip].kind == "crossing" else 1.0 for p in choices]
+            pick = rng.random() * sum(weights)
+            chosen = choices[-1]
+            for choice, weight in zip(choices, weights, strict=True):
+                pick -= weight
+                if pick < 0.0:
+                    chosen = choice
+                    break
+            walk.append(chosen.strip)
+            port = chosen.other
+        while len(walk) > 1 and strips[walk[-1]].kind == "crossing":
+            walk.pop()
+        return walk
+
+    def _corner_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+        pairs = [
+            (_number(self._index, a), _number(self._index, b))
+            for corner in self.street_map.corners.values()
+            for a in corner.ports
+            for b in corner.ports
+            if a.strip != b.strip
+        ]
+        nodes = np.array(pairs, dtype=np.int32).reshape(-1, 2)
+        gap = self.xy[nodes[:, 0]] - self.xy[nodes[:, 1]]
+        return nodes[:, 0], nodes[:, 1], np.maximum(np.hypot(gap[:, 0], gap[:, 1]), SHORTEST_HOP_M)
+
+    def _arcs_without(self, closed: frozenset[Port]) -> csr_array:
+        tails, heads, metres = self._hops
+        if closed:
+            shut = self._numbers(closed)
+            keep = ~(np.isin(tails, shut) | np.isin(heads, shut))
+            tails, heads, metres = tails[keep], heads[keep], metres[keep]
+        along_tails, along_heads, along_m = self._along
+        nodes = (np.concatenate([along_tails, tails]), np.concatenate([along_heads, heads]))
+        count = len(self.ports)
+        return csr_array((np.concatenate([along_m, metres]), nodes), shape=(count, count))
+
+    def _numbers(self, ports: Iterable[Port]) -> NDArray[np.int32]:
+        return np.array([_number(self._index, port) for port in ports], dtype=np.int32)
+
+
+def _number(index: dict[str, int], port: Port) -> int:
+    try:
+        return index[port.strip] + port.end
+    except KeyError:
+        raise MapError(f"no strip '{port.strip}' on this map to walk on") from None

@@ -1,0 +1,274 @@
+"""One episode on disk: `record.json` (what came out) and `trajectory.npz` (what happened, tick by tick).
+
+Everything in a record but its `clock` part is a function of scenario, policy and versions: two runs give the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import RunError
+from cosim.core.geometry import Floats
+from cosim.core.versions import versions
+from cosim.episode.ports import Manifest
+from cosim.episode.step import Step
+from cosim.judge.referee import Failure, Verdict
+from cosim.judge.traffic import OnRoad
+from cosim.spec.injection import Injected
+from cosim.spec.scenario import Scenario, content_hash
+
+SCHEMA = 1
+NO_RENDERER = "none"
+"""The renderer of an episode whose policy has no camera."""
+
+Status = Literal["done", "crashed", "invalid"]
+Ended = Literal["goal", "stop", "timeout", "failure"]
+
+
+@dataclass(frozen=True)
+class Log:
+    """An episode tick by tick, T rows; values at the end of each tick.
+
+    pose (T, 3) x m, y m, heading rad; speed (T, 2) v m/s, w rad/s; command (T, 2) likewise; route_s_m (T,);
+    travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
+    reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
+    on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.judge.traffic`.
+    people_tick (P,), people_xy (P, 2), people_event, people_resident (P,) bool: persons within 30 m, once a second,
+    for pictures.
+    event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
+    """
+
+    tick_s: float
+    pose: Floats
+    speed: Floats
+    command: Floats
+    route_s_m: Floats
+    travelled_m: Floats
+    person_m: Floats
+    reset_s_m: Floats
+    waits_at_red: NDArray[np.bool_]
+    on_carriageway: NDArray[np.bool_]
+    vehicles_braked: NDArray[np.int64]
+    people_tick: NDArray[np.int64]
+    people_xy: Floats
+    people_event: NDArray[np.bool_]
+    people_resident: NDArray[np.bool_]
+    event_tracks: Floats
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def row(self, tick: int) -> Floats:
+        """(14,) the values of a tick, in the order of `row_of`."""
+        columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
+        more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
+        return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)
+
+    def save(self, path: Path) -> None:
+        """Write as .npz, whole or not at all."""
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+            np.savez_compressed(file, allow_pickle=False, **arrays)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Log:
+        """Read a saved log. Raises RunError naming the file."""
+        try:
+            with np.load(path, allow_pickle=False) as arrays:
+                held = dict(arrays)
+                # Logs from before there were residents do not mention them.
+                held.setdefault("people_resident", np.zeros(len(held["people_event"]), dtype=bool))
+                values = {name: held[name] for name in (f.name for f in fields(cls))}
+        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            raise RunError(f"{path}: not a trajectory: {error}") from error
+        values["tick_s"] = float(values["tick_s"])
+        return cls(**values)
+
+
+class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
+    """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger never fired.
+
+    seen: one of its people was before the robot once (`cosim.judge.event_monitor`). rule_met: whether the robot kept the event's
+    rule; absent where there is none.
+    """
+
+    id: str
+    kind: str
+    passed: bool
+    triggered_at_s: float | None = None
+    trigger_distance_m: float | None = None
+    seen: bool = False
+    rule_met: bool | None = None
+
+
+class Record(msgspec.Struct, frozen=True, kw_only=True):
+    """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
+
+    policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
+    injections: pedestrians that came in from outside; with them the episode can be replayed.
+    invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
+    """
+
+    scenario: str
+    scenario_hash: str
+    suite: str
+    suite_hash: str
+    seed: int
+    policy: str
+    policy_version: str
+    policy_source: str = ""
+    goal_protocol: str
+    renderer: str
+    versions: dict[str, str]
+    status: Status
+    reason: str = ""
+    ended: Ended | None = None
+    ticks: int = 0
+    state_hash: str = ""
+    measures: dict[str, float | None] = {}
+    failures: tuple[Failure, ...] = ()
+    events: tuple[TriggeredEvent, ...] = ()
+    injections: tuple[Injected, ...] = ()
+    schema: int = SCHEMA
+    clock: dict[str, float] = {}
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all."""
+        temporary = path.with_name(path.name + ".part")
+        with temporary.open("wb") as file:
+            file.write(msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n")
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+
+    @classmethod
+    def load(cls, path: Path) -> Record:
+        """Read a record. Raises RunError naming the file and the field."""
+        try:
+            record = msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise RunError(f"{path}: not an episode record: {error}") from error
+        if record.schema != SCHEMA:
+            raise RunError(f"{path}: record schema {record.schema}; this version reads {SCHEMA}")
+        return record
+
+
+def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "") -> Record:
+    """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
+    return Record(
+        scenario=scenario.id,
+        scenario_hash=content_hash(scenario),
+        suite=scenario.suite,
+        suite_hash=suite_hash,
+        seed=scenario.seed,
+        policy=manifest.name,
+        policy_version=manifest.version,
+        policy_source=policy_source,
+        goal_protocol="route" if manifest.privileged else "none",
+        renderer=NO_RENDERER,
+        versions=versions(),
+        status="crashed",
+    )
+
+
+class StateHash:
+    """A running hash of everything simulated: robot, people, vehicles, signals, contacts, at every tick."""
+
+    def __init__(self) -> None:
+        self._hash = hashlib.blake2b(digest_size=16)
+
+    def add(self, step: Step) -> None:
+        robot, street = step.motion.robot, step.street_after
+        for array in (
+            np.array([*robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad]),
+            step.motion.trace,
+            street.people.xy,
+            street.people.heading,
+            street.vehicles.xy,
+            street.vehicles.heading,
+        ):
+            self._hash.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        names = [*street.people.ids, *street.vehicles.ids, *(c.other for c in step.motion.contacts)]
+        names += [f"{name}{signal.walk}" for name, signal in sorted(street.signals.items())]
+        self._hash.update("|".join(names).encode())
+
+    def hexdigest(self) -> str:
+        return self._hash.hexdigest()
+
+
+def row_of(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
+    """The 14 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
+    robot = step.motion.robot
+    track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
+    travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
+    person_m = float(_away_m(step).min(initial=np.inf))
+    reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
+    speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
+    measured = (step.route_s_after_m, travelled_m, person_m, reset_s_m, float(verdict.waits_at_red))
+    return (*robot.pose, *speeds, *measured, float(road.carriageway), float(road.braked))
+
+
+def _away_m(step: Step) -> Floats:
+    """(N,) distances of the people's centres from the robot's."""
+    xy: Floats = step.street_after.people.xy - step.motion.robot.pose.xy
+    return np.hypot(xy[:, 0], xy[:, 1])
+
+
+class Recorder:
+    """Collects the Steps of an episode into a Log."""
+
+    PEOPLE_EVERY_TICKS = 20
+    PEOPLE_WITHIN_M = 30.0
+
+    def __init__(self, tick_s: float) -> None:
+        self._tick_s = tick_s
+        self._rows: list[tuple[float, ...]] = []
+        self._people: list[tuple[int, float, float, bool, bool]] = []
+        self.hash = StateHash()
+
+    def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
+        self.hash.add(step)
+        self._rows.append(row_of(step, verdict, road))
+        if step.tick % self.PEOPLE_EVERY_TICKS == 0:
+            people = step.street_after.people
+            for i in np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M):
+                x, y = people.xy[i]
+                kind = people.ids[i][0]
+                self._people.append((step.tick, float(x), float(y), kind == "e", kind == "n"))
+
+    def log(self, event_tracks: Floats) -> Log:
+        """The episode so far. event_tracks: see `Log`."""
+        rows = np.array(self._rows, dtype=float).reshape(-1, 14)
+        people = np.array(self._people, dtype=float).reshape(-1, 5)
+        return Log(
+            tick_s=self._tick_s,
+            pose=rows[:, 0:3],
+            speed=rows[:, 3:5],
+            command=rows[:, 5:7],
+            route_s_m=rows[:, 7],
+            travelled_m=rows[:, 8],
+            person_m=rows[:, 9],
+            reset_s_m=rows[:, 10],
+            waits_at_red=rows[:, 11] > 0,
+            on_carriageway=rows[:, 12] > 0,
+            vehicles_braked=rows[:, 13].astype(np.int64),
+            people_tick=people[:, 0].astype(np.int64),
+            people_xy=people[:, 1:3],
+            people_event=people[:, 3] > 0,
+            people_resident=people[:, 4] > 0,
+            event_tracks=event_tracks,
+        )

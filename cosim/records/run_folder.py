@@ -1,0 +1,316 @@
+"""A run folder: what was asked for, and what came out, episode by episode; survives a kill at any moment.
+
+run.json                         what is run: suite, policy, scenarios, versions, renderer
+scenarios.json                   the resolved specs
+episodes/<scenario>/record.json  and trajectory.npz, written by the worker, whole or not at all
+results.sqlite                   one row per finished episode, in the order in which they ended
+results.csv                      the same, sorted by scenario, written at the end
+logs/                            what the engines of each worker printed
+lock                             held while a run is going on
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+import sqlite3
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import msgspec
+import pandas as pd
+
+from cosim.core.errors import MachineError, RunError, unknown, unwritable
+from cosim.records.record import Record
+from cosim.records.results import row_of, table_of
+from cosim.spec.scenario import Suite, write_suite
+
+DATABASE = "results.sqlite"
+REMEDY = "give the command of the run again with --resume, which makes it anew from the records on disk"
+DAMAGE = {
+    sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_MISMATCH, sqlite3.SQLITE_SCHEMA,
+}  # fmt: skip
+UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
+"""All that a run leaves that was killed before it began."""
+SAME = (
+    "suite", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios", "versions",
+    "renderer", "counterfactual",
+)  # fmt: skip
+"""What makes two runs the same."""
+
+
+class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
+    counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
+    that the policy is written in (`cosim.policies.load.source_hash`)."""
+
+    suite: str
+    suite_version: str
+    suite_hash: str
+    policy: str
+    policy_name: str
+    policy_version: str
+    policy_source: str = ""
+    scenarios: tuple[str, ...]
+    versions: dict[str, str]
+    renderer: str = "unknown"
+    counterfactual: bool = False
+    schema: int = 1
+
+
+class RunFolder:
+    """A run folder held by this process. Use as a context manager: it is locked meanwhile, before anything is written.
+
+    path: absolute, so that it stays what it is wherever the process goes. notes: what was mended as it was opened, in
+    words.
+    """
+
+    def __init__(self, path: Path, spec: RunSpec, suite: Suite | None = None) -> None:
+        self.path = path.absolute()
+        self.spec = spec
+        self.notes: list[str] = []
+        self._suite = suite
+        self._lock = -1
+
+    @classmethod
+    def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
+        """A new run folder. Raises RunError when one is there already, MachineError where nothing can be written."""
+        _refuse_used(path)
+        return cls(path, spec, suite)
+
+    @classmethod
+    def resume(cls, path: Path, spec: RunSpec) -> RunFolder:
+        """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run."""
+        found = read_spec(path)
+        if found.policy == spec.policy and found.policy_source != spec.policy_source:
+            raise RunError(
+                f"{path} is of another run: the source of policy '{spec.policy}' was edited since it began. Resume "
+                "with the source as it was, or choose another --out."
+            )
+        for field in SAME:
+            mine, theirs = getattr(spec, field), getattr(found, field)
+            if mine != theirs:
+                if isinstance(mine, dict) and isinstance(theirs, dict):
+                    changed = {name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name)}
+                    mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
+                raise RunError(
+                    f"{path} is of another run: its {field} is {_brief(theirs)}, now asked for is {_brief(mine)}. "
+                    "Resume with the same command, or choose another --out."
+                )
+        return cls(path, found)
+
+    def __enter__(self) -> Self:
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = _locked(self.path)
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+        try:
+            if self._suite is not None:
+                _refuse_used(self.path)
+                self._begin(self._suite)
+            self._open_database()
+        except BaseException:
+            os.close(self._lock)
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._lock)
+
+    def episode_folder(self, scenario_id: str) -> Path:
+        return self.path / "episodes" / scenario_id
+
+    def finished(self) -> set[str]:
+        """Ids of the scenarios that have a row."""
+        try:
+            with closing(_connect(self.path)) as database:
+                return {scenario for (scenario,) in database.execute("select scenario from episodes")}
+        except sqlite3.Error as error:
+            raise _trouble(self.path, error) from error
+
+    def add(self, record: Record) -> None:
+        """Append a finished episode. A second one of the same scenario is not taken."""
+        row = json.dumps(row_of(record), sort_keys=True)
+        text = msgspec.json.encode(record).decode()
+        try:
+            with closing(_connect(self.path)) as database, database:
+                database.execute("insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text))
+        except sqlite3.Error as error:
+            raise _trouble(self.path, error) from error
+
+    def adopt(self, scenario_id: str) -> bool:
+        """Take in the record that a worker wrote for a scenario; False when there is none, or a damaged one."""
+        path = self.episode_folder(scenario_id) / "record.json"
+        if not path.exists():
+            return False
+        try:
+            record = Record.load(path)
+        except RunError as error:
+            self.notes.append(f"{error}. This episode is run again.")
+            return False
+        if record.scenario != scenario_id:
+            self.notes.append(f"{path} is of scenario '{record.scenario}'. This episode is run again.")
+            return False
+        self.add(record)
+        return True
+
+    def forget(self, scenario_id: str) -> None:
+        """Remove what an earlier attempt at a scenario has left."""
+        path = self.episode_folder(scenario_id) / "record.json"
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+    def finish(self) -> pd.DataFrame:
+        """Write results.csv and return its table."""
+        table = table_of(read_records(self.path))
+        temporary = self.path / "results.csv.part"
+        try:
+            table.to_csv(temporary, index=False)
+            temporary.replace(self.path / "results.csv")
+        except OSError as error:
+            remedy = "all episodes are kept; make room and add --resume"
+            raise unwritable(self.path / "results.csv", error, remedy) from error
+        return table
+
+    def _begin(self, suite: Suite) -> None:
+        """Write what is run; run.json last, because a folder with it can be resumed."""
+        try:
+            for folder in (self.path / "episodes", self.path / "logs"):
+                folder.mkdir(exist_ok=True)
+            wanted = set(self.spec.scenarios)
+            chosen = msgspec.structs.replace(suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted))
+            write_suite(chosen, self.path / "scenarios.json")
+            temporary = self.path / "run.json.part"
+            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.spec), indent=1) + b"\n")
+            temporary.replace(self.path / "run.json")
+        except OSError as error:
+            raise unwritable(self.path, error) from error
+
+    def _open_database(self) -> None:
+        """Make sure of a sound database with a row for every record on disk; a damaged one is made anew from these."""
+        database, mended = self.path / DATABASE, ""
+        try:
+            _check(self.path)
+        except (sqlite3.Error, msgspec.DecodeError) as error:
+            if isinstance(error, sqlite3.Error) and not _is_damage(error):
+                raise _trouble(self.path, error) from error
+            mended = str(error)
+            for end in ("-wal", "-shm"):
+                database.with_name(DATABASE + end).unlink(missing_ok=True)
+            database.replace(database.with_name(DATABASE + ".damaged"))
+            _check(self.path)
+        on_disk = {p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")}
+        missing = sorted(set(self.spec.scenarios) & on_disk.keys() - self.finished(), key=on_disk.__getitem__)
+        taken = sum([self.adopt(scenario_id) for scenario_id in missing])
+        if mended:
+            self.notes.append(
+                f"{database} was damaged ({mended}): made anew from {taken} records on disk, kept as {DATABASE}.damaged"
+            )
+
+
+def read_spec(path: Path) -> RunSpec:
+    """What the run in a folder is. Raises UsageError, with the runs beside it, when it holds none."""
+    try:
+        return msgspec.json.decode((path / "run.json").read_bytes(), type=RunSpec)
+    except FileNotFoundError:
+        beside = [p.parent.name for p in path.parent.glob("*/run.json")] if path.parent.is_dir() else []
+        raise unknown("run", str(path), beside) from None
+    except (OSError, msgspec.DecodeError) as error:
+        raise RunError(f"{path / 'run.json'}: {error}") from error
+
+
+def read_records(path: Path) -> list[Record]:
+    """The records of a run folder, finished or not, in the order in which they ended."""
+    read_spec(path)
+    if not (path / DATABASE).exists():
+        if any(path.glob("episodes/*/record.json")):
+            raise RunError(f"{path / DATABASE} is gone: {REMEDY}")
+        return []
+    try:
+        with closing(_connect(path)) as database:
+            return _records(database)
+    except msgspec.DecodeError as error:
+        raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
+    except sqlite3.Error as error:
+        raise _trouble(path, error) from error
+
+
+def _refuse_used(path: Path) -> None:
+    """Raises RunError when a folder holds a run, or something else that is not a run's beginning."""
+    if (path / "run.json").exists():
+        raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
+    if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
+        raise RunError(f"{path} exists and is no run folder. Choose another --out.")
+
+
+def _locked(path: Path) -> int:
+    """The descriptor of the folder's lock. Raises RunError, naming the process that holds it."""
+    lock = os.open(path / "lock", os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        os.ftruncate(lock, 0)
+        os.pwrite(lock, str(os.getpid()).encode(), 0)
+    except BlockingIOError:
+        holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "?"
+        os.close(lock)
+        raise RunError(
+            f"{path} is in use by process {holder}: another cosim run is writing to it. "
+            "Wait for it to end, or choose another --out."
+        ) from None
+    except OSError:
+        os.close(lock)
+        raise
+    return lock
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    database = sqlite3.connect(path / DATABASE, timeout=30.0)
+    try:
+        database.execute("pragma journal_mode = wal")
+        database.execute("pragma synchronous = full")
+    except sqlite3.Error:
+        database.close()
+        raise
+    return database
+
+
+def _check(path: Path) -> None:
+    """Read all of the database, made where there is none. Raises sqlite3.Error or DecodeError if it is damaged."""
+    with closing(_connect(path)) as database, database:
+        database.execute("create table if not exists episodes (scenario text primary key, row text, record text)")
+        faults = [fault for (fault,) in database.execute("pragma quick_check")]
+        if faults != ["ok"]:
+            raise sqlite3.DatabaseError(faults[0])
+        _records(database)
+
+
+def _records(database: sqlite3.Connection) -> list[Record]:
+    rows: Sequence[tuple[str]] = database.execute("select record from episodes order by rowid").fetchall()
+    return [msgspec.json.decode(text, type=Record) for (text,) in rows]
+
+
+def _is_damage(error: sqlite3.Error) -> bool:
+    """Whether it is the file that is wrong, not the disk or who holds it."""
+    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
+    return code & 0xFF in DAMAGE or code == sqlite3.SQLITE_IOERR_SHORT_READ
+
+
+def _trouble(path: Path, error: sqlite3.Error) -> RunError | MachineError:
+    """What is said of an error of the database."""
+    if _is_damage(error):
+        return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
+    return MachineError(f"{path / DATABASE}: {error}. Finished episodes are safe: make room and add --resume.")
+
+
+def _brief(value: object) -> str:
+    text = str(value)
+    return text if len(text) <= 80 else text[:77] + "..."

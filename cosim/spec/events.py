@@ -1,0 +1,166 @@
+"""Event pedestrians: what is asked of a director at each tick, and what it answers.
+
+The director keeps no memory: the simulator sends the states it got last time, so a director can be killed and
+started again in the middle of an episode without a trace in the result.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from types import MappingProxyType
+from typing import Annotated, Final, Literal
+
+import msgspec
+
+from cosim.core.state import PERSON_RADIUS_M, Doing
+from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
+
+Kind = Literal["obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"]
+
+GROUPS: Mapping[Kind, tuple[int, int]] = MappingProxyType(
+    {
+        "obstructing": (1, 1), "conversing": (2, 4), "queueing": (2, 5), "frontal": (1, 1), "lateral": (1, 1),
+        "overtaking": (1, 1), "ped_crossing": (1, 4), "gesturing": (1, 1),
+    }
+)  # fmt: skip
+"""How many people each kind of event may have."""
+
+
+GUEST: Final = "ei-"
+"""What the ids of injected pedestrians begin with."""
+
+
+class Event(Ranged, frozen=True, kw_only=True):
+    """One event: a pedestrian or a group on the way.
+
+    x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
+    the robot's direction of travel. half_width_m: from there to either edge. half_length_m: of a crosswalk, from there
+    to either end along the heading. route_s_m: the same place as arc length of the reference route. people: how many.
+    speed_mps: walking speed. hold_s: how long those stay who stand. side: of the sidewalk, left (1) or right (-1).
+    """
+
+    id: str
+    kind: Kind
+    x_m: Annotated[float, WHERE_M]
+    y_m: Annotated[float, WHERE_M]
+    heading_rad: Annotated[float, HEADING_RAD]
+    route_s_m: Annotated[float, ALONG_M]
+    half_width_m: Annotated[float, Within(PERSON_RADIUS_M, 50, above=True)]
+    speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
+    hold_s: Annotated[float, Within(0, 3600)] = 20.0
+    side: Literal[-1, 1] = 1
+    people: int = 1
+    half_length_m: Annotated[float, Within(0, 50)] = 0.0
+
+    @property
+    def called(self) -> str:
+        return f"event {shown(self.id)}: "
+
+    def contradictions(self) -> Iterator[str]:
+        if not re.fullmatch(r"e[A-Za-z0-9_-]{0,31}", self.id):
+            yield (
+                f"event id {shown(self.id)}: ids of event pedestrians start with 'e', "
+                "and at most 31 of A-Z a-z 0-9 _ - follow"
+            )
+        if self.id.startswith(GUEST):
+            yield f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians"
+        fewest, most = GROUPS[self.kind]
+        if not fewest <= self.people <= most:
+            allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            yield f"{self.called}people of '{self.kind}' must be {allowed}, not {shown(self.people)}"
+        if (self.kind == "ped_crossing") != (self.half_length_m > 0.0):
+            yield f"{self.called}half_length_m is the crosswalk's: of 'ped_crossing', and of no other"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The ids of its people: its own, and with "-1", "-2" for the further ones."""
+        return (self.id, *(f"{self.id}-{k}" for k in range(1, self.people)))
+
+
+class Walker(msgspec.Struct, frozen=True, kw_only=True):
+    """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
+
+    blocked_ticks: how long it has stood against the robot. vx_mps, vy_mps: of its last step.
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    aim_rad: float | None = None
+    pace_mps: float | None = None
+    blocked_ticks: int = 0
+    vx_mps: float = 0.0
+    vy_mps: float = 0.0
+
+
+class EventState(msgspec.Struct, frozen=True, kw_only=True):
+    """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good. since_tick: in this phase.
+
+    trigger_distance_m: along the route from the robot to the event's place when it triggered, negative behind it.
+    """
+
+    phase: Literal["waiting", "acting", "over", "gone"]
+    since_tick: int
+    walkers: tuple[Walker, ...]
+    triggered_tick: int | None = None
+    trigger_distance_m: float | None = None
+
+
+class Actor(msgspec.Struct, frozen=True, kw_only=True):
+    """A pedestrian of ours as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones; a
+    guest's starts with "ei-", a resident's with "n".
+
+    speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who turns or rises on
+    the spot treads.
+    """
+
+    id: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    doing: Doing
+    pace_mps: float | None = None
+
+
+class Bystander(msgspec.Struct, frozen=True, array_like=True):
+    """Somebody who is not of an event: id, place and velocity. Ids of guests start with "e", of residents with "n"."""
+
+    id: str
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+
+
+class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
+    """What the simulator sends at each tick. states: one per event, empty at the first tick.
+
+    route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
+    bystanders: who is near the people that the director moves, see `cosim.people.neighbours`.
+    """
+
+    episode: str
+    tick: int
+    tick_ms: int
+    robot_x_m: float
+    robot_y_m: float
+    robot_heading_rad: float
+    robot_v_mps: float
+    robot_w_radps: float
+    route_s_m: float
+    robot_length_m: float
+    robot_width_m: float
+    events: tuple[Event, ...]
+    states: tuple[EventState, ...] = ()
+    bystanders: tuple[Bystander, ...] = ()
+
+
+class EventReply(msgspec.Struct, frozen=True, kw_only=True):
+    """What the director answers: the new states, one per event, and the pedestrians to show."""
+
+    episode: str
+    tick: int
+    states: tuple[EventState, ...]
+    actors: tuple[Actor, ...]

@@ -1,0 +1,316 @@
+"""Scenario and Suite: frozen specs of what is measured, and their files.
+
+A spec is complete: the same spec gives the same episode, bit for bit, in any process.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Polyline, Pose
+from cosim.spec.events import Event
+from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
+from cosim.spec.spec_file import read_spec_file
+
+SCHEMA = 1
+"""Version of the scenario files; a reader refuses others."""
+SHORTEST_M = 1.0
+LONGEST_M = 20_000.0
+"""Of a reference route."""
+SLACK_M = 0.01
+EVENT_BEYOND_M = 60.0
+"""Who comes towards the robot may start from beyond the goal, so far."""
+SHARE = Within(0, 1, words="must be a share in {range}, not {value}")
+NAME = Text(200)
+FOLDER = Named("a folder")
+
+
+class _Uneven(Ranged, frozen=True, kw_only=True):
+    """A place whose ground may be uneven. roughness: from 0 (flat) to 1; a spec of flat ground does not mention it,
+    so that it keeps the hash it had before there was uneven ground."""
+
+    roughness: Annotated[
+        float | msgspec.UnsetType, Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
+    ] = msgspec.UNSET
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.roughness == 0.0:
+            msgspec.structs.force_setattr(self, "roughness", msgspec.UNSET)
+
+    @property
+    def unevenness(self) -> float:
+        """The roughness of the ground, 0 where the spec does not mention it."""
+        return 0.0 if isinstance(self.roughness, msgspec.UnsetType) else self.roughness
+
+
+CITY_SIZE_M = Within(200, 4000)
+"""In a smaller square there is no room for two blocks."""
+
+
+class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
+    """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the scenario was made
+    on."""
+
+    seed: Annotated[int, SEED]
+    size_m: Annotated[float, CITY_SIZE_M] = 2000.0
+    style: Annotated[str, Named("a style")] = "mixed"
+    net_hash: Annotated[str, NAME] = ""
+
+    def contradictions(self) -> Iterator[str]:
+        if round(self.size_m, 2) != self.size_m:
+            yield f"city size_m must be in whole centimetres, not {self.size_m}"
+
+    @property
+    def name(self) -> str:
+        return f"city-{self.style}-{self.size_m:g}m-{self.seed}"
+
+
+class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
+    """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
+
+    map: Annotated[str, NAME]
+    seed: Annotated[int, SEED] = 0
+    net_hash: Annotated[str, NAME] = ""
+
+    @property
+    def name(self) -> str:
+        return f"map-{self.map}"
+
+
+Place = City | CityMap
+
+
+class Barrier(Ranged, frozen=True, kw_only=True):
+    """A fence across a way. heading_rad: along the way it closes; length_m: across it.
+
+    strip, end: the port of the walking graph that it closes.
+    """
+
+    x_m: Annotated[float, WHERE_M]
+    y_m: Annotated[float, WHERE_M]
+    heading_rad: Annotated[float, HEADING_RAD]
+    length_m: Annotated[float, Within(0.1, 200)]
+    strip: Annotated[str, NAME]
+    end: Literal[0, 1]
+    thickness_m: Annotated[float, Within(0.01, 2)] = 0.12
+    height_m: Annotated[float, Within(0.1, 5)] = 1.0
+
+
+class RouteCrossing(Ranged, frozen=True, kw_only=True):
+    """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
+
+    id: Annotated[str, NAME]
+    enter_s_m: Annotated[float, ALONG_M]
+    leave_s_m: Annotated[float, ALONG_M]
+    signalised: bool
+
+    @property
+    def called(self) -> str:
+        return f"crossing {shown(self.id)}: "
+
+    def contradictions(self) -> Iterator[str]:
+        if self.enter_s_m > self.leave_s_m:
+            yield f"{self.called}enter_s_m {self.enter_s_m} comes after leave_s_m {self.leave_s_m}"
+
+
+DEFAULT_PERSONS = 50
+MOST_PERSONS = 1000
+"""More take SUMO longer than a run waits for an episode."""
+MOST_PER_1000_M2 = 150.0
+"""Denser crowds have no room to enter 1.5 m apart."""
+
+
+class CrowdSpec(Ranged, frozen=True, kw_only=True):
+    """The street life around the robot: persons and vehicles kept within radius_m of it.
+
+    density: persons per 1000 m2 of walkable ground there, in place of a number of persons.
+    residents: people besides who know the street, sit on its benches, look into its shop windows, wait at its stops
+    (`scenarios.residents`); so many are kept within 60 m of the robot.
+    Shares of the persons: groups, of those who walk in groups of two and three; elderly and children, of those who walk
+    slower than others. A child walks in a group with an adult, at the child's pace.
+    """
+
+    persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
+    radius_m: Annotated[float, Within(20, 500)] = 80.0
+    vehicles: Annotated[int, Within(0, 200)] = 20
+    density: Annotated[
+        float | msgspec.UnsetType,
+        Within(0, MOST_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
+    ] = msgspec.UNSET
+    residents: Annotated[int, Within(0, 60)] = 0
+    groups: Annotated[float, SHARE] = 0.0
+    elderly: Annotated[float, SHARE] = 0.0
+    children: Annotated[float, SHARE] = 0.0
+
+    @property
+    def called(self) -> str:
+        return "crowd "
+
+    def contradictions(self) -> Iterator[str]:
+        if 2.0 * self.children > self.groups + 1e-9:
+            yield (
+                f"crowd children must be in [0, groups / 2] = [0, {self.groups / 2:g}], not {self.children}: "
+                f"each walks in a group with an adult; give groups of {2.0 * self.children:g} or more"
+            )
+        if self.elderly + 2.0 * self.children > 1.0 + 1e-9:
+            yield (
+                f"crowd elderly must be in [0, 1 - 2 children] = [0, {1.0 - 2.0 * self.children:g}], "
+                f"not {self.elderly}: children walk with adults who are not elderly"
+            )
+        if not isinstance(self.density, msgspec.UnsetType) and self.persons != DEFAULT_PERSONS:
+            yield f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both"
+
+
+class Light(Ranged, frozen=True, kw_only=True, omit_defaults=True):
+    """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
+
+    hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
+    leaves 5 % of a contrast (the meteorologists' visibility), None without fog. exposure_ev: stops brighter (+) or
+    darker (-) than the camera would choose. hdri: path of an equirectangular Radiance .hdr that replaces sky and sun.
+    """
+
+    hour: Annotated[float, Within(0, 24)] = 13.0
+    day_of_year: Annotated[int, Within(1, 366)] = 172
+    latitude_deg: Annotated[float, Within(-90, 90)] = 48.0
+    cloud_cover: Annotated[float, Within(0, 1)] = 0.25
+    fog_m: Annotated[float | None, Within(10, 50_000)] = None
+    exposure_ev: Annotated[float, Within(-4, 4)] = 0.0
+    shadows: bool = True
+    hdri: Annotated[str, Text(1000)] = ""
+
+    def contradictions(self) -> Iterator[str]:
+        if self.hdri and not self.hdri.lower().endswith(".hdr"):
+            yield f"light hdri must be a Radiance .hdr file, not {shown(self.hdri)}"
+
+
+class Scenario(Ranged, frozen=True, kw_only=True):
+    """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
+
+    id: Annotated[str, FOLDER]
+    suite: Annotated[str, NAME]
+    place: Place
+    seed: Annotated[int, SEED]
+    start: tuple[float, float, float]
+    goal: tuple[float, float]
+    route: Annotated[tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)]
+    crossings: Annotated[tuple[RouteCrossing, ...], Counted(0, 1000)] = ()
+    barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
+    events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
+    crowd: CrowdSpec = CrowdSpec()
+    robot: Annotated[str, NAME] = "courier"
+    goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
+    time_limit_s: Annotated[float, Within(0.1, 100_000)] = 300.0
+    ends_on_failure: bool = False
+    ends_at: Literal["goal", "stop"] = "goal"
+    light: Light = Light()
+    schema: int = SCHEMA
+
+    @property
+    def called(self) -> str:
+        return "scenario " if FOLDER.refusal("id", self.id) else f"scenario '{self.id}': "
+
+    def contradictions(self) -> Iterator[str]:
+        if self.schema != SCHEMA:
+            yield f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads {SCHEMA}"
+        if len(self.route) < 2:
+            yield f"{self.called}route needs two points or more"
+            return
+        for field, (x, y), end in (("start", self.start[:2], self.route[0]), ("goal", self.goal, self.route[-1])):
+            if not abs(x - end[0]) + abs(y - end[1]) <= 1e-6:
+                yield f"{self.called}{field} {(x, y)} is not the route's end {end}"
+        yield HEADING_RAD.refusal(f"{self.called}start's heading", self.start[2])
+        length_m = float(np.hypot(*np.diff(self.route, axis=0).T).sum())
+        yield Within(SHORTEST_M, LONGEST_M).refusal(f"{self.called}the length of the route, m,", length_m)
+        if length_m <= 2.0 * self.goal_radius_m:
+            yield (
+                f"{self.called}goal_radius_m must be less than half of the route's {length_m:g} m, "
+                f"not {self.goal_radius_m}"
+            )
+        places = [(crossing.called, "leave_s_m", crossing.leave_s_m, SLACK_M) for crossing in self.crossings]
+        places += [(event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events]
+        for called, field, s_m, beyond_m in places:
+            if s_m > length_m + beyond_m:
+                yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
+        if self.ends_at == "stop" and all(event.kind != "gesturing" for event in self.events):
+            yield f"{self.called}ends_at 'stop' needs an event 'gesturing': somebody to stop for"
+        names = Counter(name for event in self.events for name in event.names)
+        if twice := sorted(name for name, count in names.items() if count > 1):
+            yield f"{self.called}two events have a pedestrian '{twice[0]}': give one another id"
+
+    @property
+    def start_pose(self) -> Pose:
+        return Pose(*self.start)
+
+    @property
+    def route_line(self) -> Polyline:
+        return Polyline(self.route)
+
+
+class Suite(Ranged, frozen=True, kw_only=True):
+    """A named, versioned list of scenarios."""
+
+    name: Annotated[str, Named("a suite, and the folder of a run")]
+    version: Annotated[str, NAME]
+    scenarios: tuple[Scenario, ...]
+    description: Annotated[str, Text(10_000)] = ""
+
+    def contradictions(self) -> Iterator[str]:
+        times = Counter(scenario.id for scenario in self.scenarios)
+        if twice := sorted(name for name, count in times.items() if count > 1):
+            more = f" and {len(twice) - 5} more" if len(twice) > 5 else ""
+            yield f"suite '{self.name}' lists scenarios twice: {', '.join(twice[:5])}{more}"
+
+    @property
+    def content_hash(self) -> str:
+        """SHA-256 of the suite's canonical JSON, 16 hex digits."""
+        return content_hash(self)
+
+
+def content_hash(spec: msgspec.Struct) -> str:
+    """SHA-256 of a spec's canonical JSON, 16 hex digits."""
+    return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
+
+
+ADDED: Mapping[str, object] = MappingProxyType(
+    {
+        "light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0, "residents": 0,
+        "groups": 0.0, "elderly": 0.0, "children": 0.0,
+    }
+)  # fmt: skip
+"""Fields that came later, with the values that mean what was meant before there were such fields."""
+
+
+def _canonical(spec: msgspec.Struct) -> bytes:
+    """JSON of a spec. What was ADDED is left out of scenarios, crowds and events where it says nothing new, so that a
+    spec has the bytes and the hash it had before."""
+    tree = msgspec.to_builtins(spec, order="deterministic")
+    for scenario in tree.get("scenarios", [tree]):
+        for part in (scenario, scenario.get("crowd", {}), *scenario.get("events", ())):
+            for field in [name for name, before in ADDED.items() if part.get(name) == before]:
+                del part[field]
+    return msgspec.json.encode(tree)
+
+
+def read_suite(path: Path) -> Suite:
+    """The suite in a JSON file. Raises SpecError naming the file and the field, and what may stand there."""
+    suite = read_spec_file(path, Suite)
+    if not suite.scenarios:
+        raise SpecError(f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more")
+    return suite
+
+
+def write_suite(suite: Suite, path: Path) -> None:
+    """Write a suite as readable JSON: one scenario a line."""
+    head = msgspec.json.encode({"name": suite.name, "version": suite.version, "description": suite.description})
+    rows = b",\n".join(_canonical(s) for s in suite.scenarios)
+    path.write_bytes(head[:-1] + b',"scenarios":[\n' + rows + b"\n]}\n")

@@ -1,0 +1,192 @@
+"""Specs in JSON files: read whole, or refused with every fault at once, each with its place in the file."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from itertools import islice
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin
+
+import msgspec
+
+from cosim.core.errors import SpecError
+from cosim.spec.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of
+
+MOST_BYTES: Final = 1_000_000_000
+MOST_TOLD: Final = 5
+MOST_COUNTED: Final = 1000
+"""Of more faults than this it is only said that there are more."""
+MOST_LETTERS: Final = 400
+"""Of one fault."""
+_PLACE: Final = re.compile(r" - at `(key in )?\$[^`]*`$")
+_BYTE: Final = re.compile(r" \(byte (\d+)\)$")
+_REFUSED: Final = (msgspec.DecodeError, ValueError, RecursionError)
+
+Spec = TypeVar("Spec", bound=msgspec.Struct)
+
+
+def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
+    """The spec in a JSON file. Raises SpecError naming the file, and of each fault the place and what may stand there:
+    one on a line, the first MOST_TOLD of them."""
+    try:
+        if path.exists() and not path.is_file():
+            raise SpecError(f"{path}: is no file")
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise SpecError(f"{path}: holds {size} bytes; at most {MOST_BYTES} are read")
+        data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    except OSError as error:
+        raise SpecError(f"{path}: cannot be read: {error.strerror}") from error
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except _REFUSED as error:
+        faults = list(islice(_faults(data, kind, error), MOST_COUNTED))
+        raise SpecError(f"{path}: {in_lines(faults)}") from error
+
+
+def in_lines(faults: Sequence[str]) -> str:
+    """A fault as it is; of several, their number and the first MOST_TOLD of them, a line each."""
+    if len(faults) == 1:
+        return faults[0]
+    count = f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
+    which = f"; the first {MOST_TOLD}" if len(faults) > MOST_TOLD else ""
+    return "\n  ".join([f"{count}{which}:", *faults[:MOST_TOLD]])
+
+
+def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
+    """Every fault of a file that was refused with `error`."""
+    if _of_the_whole(error):
+        yield f"{error} - at `$`"
+        return
+    try:
+        # It takes NaN and numbers without end, which the other reader refuses without naming their field.
+        tree = json.loads(data)
+    except (ValueError, RecursionError):
+        yield _malformed(data, error)
+        return
+    found = False
+    for fault in _faults_in(tree, kind, "$"):
+        found = True
+        yield fault
+    if not found:
+        yield _malformed(data, error)
+
+
+def _malformed(data: bytes, refused: Exception) -> str:
+    """Why a file is no JSON, and where."""
+    error = _syntax_error(data) or refused
+    message = str(error)
+    if isinstance(error, RecursionError):
+        return "is nested too deep: brackets within brackets within brackets"
+    if isinstance(error, UnicodeDecodeError):
+        return f"is no UTF-8 text, {_where(data, _readable(data))}"
+    if message == "Input data was truncated":
+        return f"JSON ends too early, {_where(data, len(data))}"
+    if byte := _BYTE.search(message):
+        return f"{message[: byte.start()]}, {_where(data, int(byte[1]))}"
+    return message if _PLACE.search(message) else f"{message} - at `$`"
+
+
+def _syntax_error(data: bytes) -> Exception | None:
+    """What is wrong with a file as JSON, whatever it should hold; None if nothing is."""
+    try:
+        msgspec.json.decode(data)
+    except _REFUSED as error:
+        return error
+    return None
+
+
+def _readable(data: bytes) -> int:
+    """How many bytes from the beginning are UTF-8."""
+    try:
+        return len(data.decode())
+    except UnicodeDecodeError as error:
+        return error.start
+
+
+def _where(data: bytes, byte: int) -> str:
+    lines = data[:byte].split(b"\n")
+    return f"line {len(lines)}, byte {len(lines[-1])} of it"
+
+
+def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
+    """Every fault of a value that should be of a type: those of its parts, where they have none its own."""
+    try:
+        msgspec.convert(tree, kind)
+        return
+    except _REFUSED as error:
+        message, whole = str(error), _of_the_whole(error)
+    found = False
+    for fault in () if whole else _faults_below(tree, _bare(kind, tree), place):
+        found = True
+        yield fault
+    if found:
+        yield from _out_of_range(tree, _bare(kind, tree), place)
+    else:
+        yield f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at `{place}`{_choices(kind, tree)}"
+
+
+def _of_the_whole(error: Exception) -> bool:
+    """Whether a value was refused for a contradiction of its own: then its parts are sound."""
+    return isinstance(error.__cause__, SpecError) and not _PLACE.search(str(error))
+
+
+def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
+    """The faults of the parts of a value; none where it is of another shape altogether."""
+    if isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct):
+        fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
+        for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
+            yield f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at `{place}`{_listed(fields)}"
+        for name, field in fields.items():
+            if name in tree:
+                yield from _faults_in(tree[name], field.type, f"{place}.{name}")
+            elif field.required:
+                yield f"Object missing required field `{name}` - at `{place}`"
+    elif isinstance(tree, list) and get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if parts[-1] is not Ellipsis and len(parts) != len(tree):
+            return
+        for number, item in enumerate(tree):
+            part = parts[0] if parts[-1] is Ellipsis else parts[number]
+            yield from _faults_in(item, part, f"{place}[{number}]")
+
+
+def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
+    """The fields of a value that are out of their range; those of another type are told of already."""
+    if not (isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, Ranged)):
+        return
+    types = {field.name: field.type for field in msgspec.structs.fields(kind)}
+    for field, rule in rules_of(kind):
+        with suppress(*_REFUSED):
+            if field in tree and (refusal := refusal_of(field, rule, msgspec.convert(tree[field], types[field]))):
+                yield f"{refusal} - at `{place}`"
+
+
+def _bare(kind: Any, tree: Any) -> Any:
+    """A type without its range; of several kinds of objects the one that the value says it is."""
+    if get_origin(kind) is Annotated:
+        return _bare(get_args(kind)[0], tree)
+    if get_origin(kind) in (Union, UnionType):
+        for one in get_args(kind):
+            config = getattr(one, "__struct_config__", None)
+            if config is not None and isinstance(tree, dict) and tree.get(config.tag_field) == config.tag:
+                return one
+    return kind
+
+
+def _choices(kind: Any, tree: Any) -> str:
+    """The values that may stand where another does."""
+    bare = _bare(kind, tree)
+    if get_origin(bare) is Literal:
+        return _listed(get_args(bare))
+    if get_origin(bare) in (Union, UnionType):
+        tags = [one.__struct_config__.tag for one in get_args(bare) if hasattr(one, "__struct_config__")]
+        return _listed(tags)
+    return ""
+
+
+def _listed(valid: Any) -> str:
+    return f". Valid choices: {', '.join(map(str, valid))}" if valid else ""

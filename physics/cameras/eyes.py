@@ -1,0 +1,63 @@
+"""WorldCamera: what the cameras of a world share: their mount, their lens, views for humans, and that they end."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+
+from numpy.typing import ArrayLike
+
+from cosim.core.state import Frame, RobotState, Street
+from cosim.episode.ports import CameraSpec
+from physics.cameras.lens import drawn, through
+from physics.cameras.view import Shot, check_size, robot_shot, shot
+from physics.world.world import BulletWorld
+
+
+class WorldCamera(ABC):
+    """The robot's camera in a world. Use it in a `with` block; the world need not be running.
+
+    A subclass starts its renderer on entering and draws what a `Shot` shows.
+    """
+
+    def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool) -> None:
+        check_size(spec.width, spec.height, spec.fov_deg)
+        self.spec, self._pinhole = spec, drawn(spec)
+        self._world, self._depth = world, depth
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @abstractmethod
+    def close(self) -> None:
+        """End the renderer; a second call does nothing."""
+
+    @abstractmethod
+    def _drawn(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Frame:
+        """What a shot shows. body: the robot's own body is in the picture."""
+
+    def render(self, robot: RobotState, street: Street) -> Frame:
+        """What the robot sees from its mount, through its lens; it leans with the ground, and its own body is not in
+        the picture."""
+        return self.through_lens(self._drawn(self._mounted(robot), street, robot, body=False), robot, street)
+
+    def picture(
+        self,
+        eye_m: ArrayLike,
+        target_m: ArrayLike,
+        street: Street,
+        robot: RobotState | None = None,
+        size: tuple[int, int] = (640, 480),
+        fov_deg: float = 60.0,
+    ) -> Frame:
+        """A view for humans from (3,) `eye_m` towards (3,) `target_m`, with the robot in it; size: width, height."""
+        return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot, body=True)
+
+    def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
+        """What the lens makes of a picture as the robot's pinhole camera would see it."""
+        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
+
+    def _mounted(self, robot: RobotState) -> Shot:
+        return robot_shot(self._world.ground, self._world.model, self._pinhole, robot)

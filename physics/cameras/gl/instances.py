@@ -1,0 +1,231 @@
+"""Rigid things drawn by the hundred: one call for all, however many forms they have.
+
+A form is a mesh with the colours of its parts; an instance is a form at a place, turned, with a paint of its own. All
+forms lie in one buffer, and the counts of a draw lie in another (multi-draw indirect).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from typing import Final, NamedTuple
+
+import moderngl
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from cosim.core.geometry import Floats
+from physics.cameras.gl.corners import LAYOUT, Rows, corners, joined
+from physics.cameras.gl.shading import Stage, programs
+from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.world.mesh import Mesh
+
+Colour = tuple[float, float, float]
+
+INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
+"""at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its fourth."""
+
+_OWN, _PAINT, _GLOW = 255, 0, 128
+"""Fourth channel of a corner's colour: its own, the instance's, or the instance's and shining. Where it is not its own
+the colour says how much light reaches the corner."""
+_BARE, _LAMP = 255, 254
+"""Fourth channel of a corner's normal, if not a layer of the surfaces: nothing lies on it, or it shines at night."""
+_LAMPLIGHT: Final = "6.0e-3, 4.8e-3, 3.0e-3"
+"""Radiance of a street lamp's glass as far as a camera is to see it, in the units of physics.cameras.sky."""
+
+_VERTEX: Final = f"""
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
+in vec3 thing_at; in vec4 thing_turn; in vec4 thing_paint;
+out vec3 at; out vec3 normal; out vec3 albedo; out vec3 spot; out vec3 side;
+flat out float label; flat out float shines; flat out float cover;
+vec3 turned(vec3 v) {{ return v + 2.0 * cross(thing_turn.xyz, cross(thing_turn.xyz, v) + thing_turn.w * v); }}
+void main() {{
+    at = thing_at + turned(in_at);
+    side = unpacked(in_normal);
+    normal = turned(side);
+    bool own = in_colour.a > 0.75;
+    vec3 colour = own ? in_colour.rgb : thing_paint.rgb;
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    shines = (in_colour.a > 0.25 && !own) ? 1.0 : 0.0;
+    cover = layer < {_LAMP} ? float(layer) : -1.0;
+    albedo = shines > 0.5 ? colour : layer < {_LAMP} ? tint_of(colour, layer) : decoded(colour);
+    albedo *= own ? 1.0 : in_colour.r;
+    shines = layer == {_LAMP} ? -1.0 : shines;
+    spot = layer < {_LAMP} ? in_at / layers[layer].w : vec3(0.0);
+    label = thing_paint.a * 255.0;
+    gl_Position = project(at);
+}}
+"""
+
+_FRAGMENT: Final = f"""
+in vec3 at; in vec3 normal; in vec3 albedo; in vec3 spot; in vec3 side;
+flat in float label; flat in float shines; flat in float cover;
+void main() {{
+    if (shines > 0.5) {{ glow(albedo, label); return; }}
+    vec3 colour = albedo, own = vec3(0.0), n = normalize(normal);
+    if (cover >= 0.0) {{
+        vec3 s = abs(side);
+        vec2 where = s.z > max(s.x, s.y) ? spot.xy : s.x > s.y ? spot.yz : spot.xz;
+        vec4 seen = texture(surfaces, vec3(where, cover));
+        colour *= decoded(seen.rgb);
+    }} else if (shines < -0.5) {{
+        own = vec3({_LAMPLIGHT}) * side_light.w;
+    }}
+    show_linear(colour, own, n, at, label);
+}}
+"""
+
+
+class Coat(NamedTuple):
+    """A part of a form. colour: None is the instance's paint; glows: shines in it. cover: the layer of the surfaces
+    that lies on it, "lamp" for what shines at night, "" for nothing; shade: (V,) light that reaches its corners."""
+
+    mesh: Mesh
+    colour: Colour | None = None
+    glows: bool = False
+    cover: str = ""
+    shade: Floats | None = None
+
+
+class Forms:
+    """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
+
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
+        self._context, self._layers = context, surfaces.surfaces
+        self.programs = programs(context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
+        for uniform in self.programs.uniforms("layers"):
+            if uniform is not None:
+                uniform.write(surfaces.known)
+        self._corners: list[NDArray[np.void]] = []
+        self._indices: list[NDArray[np.uint32]] = []
+        self._ids: dict[Hashable, int] = {}
+        self._starts: list[tuple[int, int, int]] = []
+        self.rank = np.zeros(0, dtype=np.int64)
+        self.draws = np.zeros((0, 3), dtype=np.uint32)
+        self.version = 0
+        self._held = -1
+        self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
+
+    def id(self, key: Hashable, parts: Callable[[], Sequence[Coat]]) -> int:
+        """The number of a form; `parts` makes it when its key is new."""
+        if key not in self._ids:
+            self._add(key, parts())
+        return self._ids[key]
+
+    def _add(self, key: Hashable, parts: Sequence[Coat]) -> None:
+        rows, indices = joined([(coat.mesh, self._rows(coat)) for coat in parts])
+        first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
+        self._corners.append(rows)
+        self._indices.append(indices)
+        self._ids[key] = len(self._ids)
+        self._starts.append((len(self._indices[-1]), first, base))
+        by_name = sorted(self._ids, key=repr)  # an order that does not hang on what was seen first
+        self.rank = np.zeros(len(by_name), dtype=np.int64)
+        self.rank[[self._ids[name] for name in by_name]] = np.arange(len(by_name))
+        self.draws = np.array(self._starts, dtype=np.uint32)
+        self.version += 1
+
+    def _rows(self, coat: Coat) -> Rows:
+        shade = np.ones(len(coat.mesh.vertices)) if coat.shade is None else coat.shade
+        colour = np.tile(coat.colour, (len(shade), 1)) if coat.colour else np.ones((len(shade), 3))
+        rows = corners(coat.mesh, colour * shade[:, None], _GLOW if coat.glows else _OWN if coat.colour else _PAINT)
+        named = {"": _BARE, "lamp": _LAMP}
+        rows["normal"][:, 3] = named[coat.cover] if coat.cover in named else self._layers.index(coat.cover)
+        return rows
+
+    def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:
+        """Corners and triangles of all forms; arrays bound to those of an older `version` are void."""
+        if self._buffers is None or self._held != self.version:
+            self.release()
+            first = self._context.buffer(np.concatenate(self._corners).tobytes())
+            self._buffers = first, self._context.buffer(np.concatenate(self._indices).tobytes())
+            self._held = self.version
+        return self._buffers
+
+    def release(self) -> None:
+        for buffer in self._buffers or ():
+            buffer.release()
+        self._buffers = None
+
+
+class Things:
+    """A set of instances, replaced as a whole, drawn in one call. stages: the passes in which it is drawn."""
+
+    def __init__(self, context: moderngl.Context, forms: Forms, stages: Sequence[Stage]) -> None:
+        self._context, self._forms, self._stages = context, forms, stages
+        self._bound = -1
+        self._room = 0
+        self._count = 0
+        self._instances: moderngl.Buffer | None = None
+        self._commands: moderngl.Buffer | None = None
+        self._arrays: list[moderngl.VertexArray] = []
+
+    def set(self, form: NDArray[np.int64], rows: NDArray[np.void]) -> None:
+        """(N,) numbers of forms and (N,) rows of INSTANCE."""
+        self._count = 0
+        if not len(form):
+            return
+        order = self._forms.rank[form].argsort(kind="stable")
+        form = form[order]
+        first = np.concatenate([[0], (form[1:] != form[:-1]).nonzero()[0] + 1])
+        self._count = len(first)
+        commands = np.empty((len(first), 5), dtype=np.uint32)
+        draws = self._forms.draws[form[first]]
+        commands[:, 0], commands[:, 2:4], commands[:, 4] = draws[:, 0], draws[:, 1:], first
+        commands[:-1, 1], commands[-1, 1] = first[1:] - first[:-1], len(form) - first[-1]
+        if len(form) > self._room:
+            self._make_room(2 * len(form))
+        assert self._instances is not None and self._commands is not None
+        self._instances.write(rows[order])
+        self._commands.write(commands)
+
+    def draw(self, stage: Stage) -> None:
+        if self._count and stage in self._stages:
+            if self._bound != self._forms.version:
+                self._bind()
+            assert self._commands is not None
+            self._arrays[stage != "colour"].render_indirect(self._commands, moderngl.TRIANGLES, count=self._count)
+
+    def _make_room(self, count: int) -> None:
+        self._drop()
+        self._room = max(64, count)
+        self._instances = self._context.buffer(reserve=self._room * INSTANCE.itemsize, dynamic=True)
+        self._commands = self._context.buffer(reserve=self._room * 20, dynamic=True)
+
+    def _bind(self) -> None:
+        at_corners, triangles = self._forms.buffers()
+        for array in self._arrays:
+            array.release()
+        content = [
+            (at_corners, *LAYOUT),
+            (self._instances, "3f 4f 4f1 /i", "thing_at", "thing_turn", "thing_paint"),
+        ]
+        self._arrays = [
+            self._context.vertex_array(program, content, triangles, skip_errors=True)
+            for program in self._forms.programs
+        ]
+        self._bound = self._forms.version
+
+    def _drop(self) -> None:
+        for thing in (*self._arrays, self._instances, self._commands):
+            if thing is not None:
+                thing.release()
+        self._arrays, self._instances, self._commands, self._bound = [], None, None, -1
+
+    def release(self) -> None:
+        self._drop()
+        self._room = self._count = 0
+
+
+def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int, about_y: ArrayLike = 0.0) -> Rows:
+    """Rows of INSTANCE. at: (N, 3) from the anchor; heading, about_y: radians, a turn about the thing's own y axis
+    comes first; paint: (N, 3) or (3,)."""
+    at = np.asarray(at, dtype=float).reshape(-1, 3)
+    half_z, half_y = 0.5 * np.asarray(heading, dtype=float), 0.5 * np.asarray(about_y, dtype=float)
+    cz, sz, cy, sy = np.cos(half_z), np.sin(half_z), np.cos(half_y), np.sin(half_y)
+    rows = np.zeros(len(at), dtype=INSTANCE)
+    rows["at"] = at
+    turn = rows["turn"]
+    turn[:, 0], turn[:, 1], turn[:, 2], turn[:, 3] = -sz * sy, cz * sy, sz * cy, cz * cy
+    rows["paint"][:, :3] = np.rint(255.0 * np.asarray(paint, dtype=float))
+    rows["paint"][:, 3] = label
+    return rows

@@ -1,0 +1,87 @@
+"""The light of a picture as shaders take it, made from a sky."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
+from physics.cameras.sky import Sky
+
+HAZE_FROM_M: Final = 20.0
+HAZE_PER_M: Final = 1.0 / 110.0
+HAZE_MOST: Final = 0.85
+"""Beside the fog of a scenario distant things fade a little in any weather, so that the end of the drawn world is no
+edge; the bullet camera does the same."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lighting:
+    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that looks
+    there; horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky; lamps: 0 by day to 1 at night;
+    shadows: whether there are any."""
+
+    to_sun: Floats
+    sun: Floats
+    up: Floats
+    side: Floats
+    down: Floats
+    fog: Floats
+    horizon: Floats
+    fog_per_m: float
+    exposure: float
+    lamps: float
+    shadows: bool
+
+    def seen(self, heading_rad: float, half_angle_rad: float) -> Lighting:
+        """The light of a picture: what is far fades into the sky that is behind it, not into the sky all around."""
+        columns = len(self.horizon)
+        turn = math.pi - 2.0 * math.pi * (np.arange(columns) + 0.5) / columns - heading_rad
+        aside = np.abs((turn + math.pi) % (2.0 * math.pi) - math.pi)
+        behind = aside < max(min(half_angle_rad, 0.5 * math.pi), 2.0 * math.pi / columns)
+        return replace(self, fog=self.horizon[behind].mean(axis=0))
+
+    def rows(self) -> list[tuple[float, ...]]:
+        """What the uniform block `Scene` holds of it, vec4 after vec4."""
+        return [
+            (*self.to_sun, float(self.shadows)),
+            (*self.sun, self.exposure),
+            (*self.side, self.lamps),
+            (*(0.5 * (self.up - self.down)), 0.0),
+            (*(0.5 * (self.up + self.down) - self.side), 0.0),
+            (*self.fog, self.fog_per_m),
+            (HAZE_FROM_M, HAZE_PER_M, HAZE_MOST, 0.0),
+        ]
+
+
+def lighting_of(sky: Sky) -> Lighting:
+    """What a sky is to the shaders."""
+    up, side, down = sky.ambient
+    return Lighting(
+        sky.sun, sky.sun_colour, up, side, down, sky.fog_colour, _horizon(sky), sky.fog_per_m, sky.exposure, sky.lamps,
+        sky.shadows,
+    )  # fmt: skip
+
+
+def _horizon(sky: Sky) -> Floats:
+    rows = len(sky.radiance)
+    around = sky.radiance[rows // 2 - max(1, rows // 40) : rows // 2].mean(axis=0, dtype=float)
+    # The sun itself is no colour of the haze.
+    limit = 2.0 * np.median(around, axis=0)
+    return np.asarray(np.minimum(around, limit))
+
+
+def sky_texture(context: moderngl.Context, radiance: NDArray[np.float32]) -> moderngl.Texture:
+    """An equirectangular picture (H, W, 3) as a texture."""
+    rows, columns, _ = radiance.shape
+    texture = context.texture(
+        (columns, rows), 3, np.minimum(radiance, 6.0e4).astype(np.float16).tobytes(), dtype="f2", alignment=2
+    )
+    texture.filter = moderngl.LINEAR, moderngl.LINEAR
+    texture.repeat_x, texture.repeat_y = True, False
+    return texture

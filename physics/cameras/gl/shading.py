@@ -1,0 +1,224 @@
+"""Shading: the GLSL that all programs share, the uniform block they read, and the passes they are drawn in.
+
+A drawable's program is written once and works in every pass. `programs` puts this file's chunks before its code:
+
+vertex shader     reads its own attributes and ends with `gl_Position = project(at);`, where `at` is a position in
+                  metres relative to the anchor of the picture (below). Normals are in world axes.
+fragment shader   calls `show(albedo, normal, at, label)` once, or `glow(colour, label)` for what shines by itself.
+                  albedo, colour: vec3 sRGB, 0 to 1; normal: vec3, unit length or nearly; at: as in the vertex
+                  shader; label: float, an id of cosim.core.state.LABELS. `show_linear` takes a linear albedo (sRGB
+                  textures are decoded when they are read) and a radiance of the surface's own.
+                  In the shadow pass it is not run: leave the depth alone and do not discard.
+
+Positions are relative to the anchor, a point of the ground near the eye on a lattice of ANCHOR_M, so that float32 holds
+them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres: subtract
+it in float64 before an upload.
+
+The uniform block `Scene` (binding SCENE_BINDING, written once per pass by `SceneBlock`):
+
+    mat4 clip_from_at      the camera's, or the sun's in the shadow pass; `project` is all that needs it
+    mat4 shadow_from_at    to the shadow map's texture space
+    vec4 eye               xyz from the anchor
+    vec4 sun               xyz towards the sun; w 1 where it throws shadows
+    vec4 sun_light         rgb linear; w exposure
+    vec4 side_light        rgb linear, ambient of an upright surface; w lamps: 0 by day to 1 at night
+    vec4 tilt_light        rgb linear, what is added times the z of the normal
+    vec4 flat_light        rgb linear, what is added times the size of the z of the normal
+    vec4 fog               rgb linear; w extinction per metre
+    vec4 haze              where it begins in metres, share per metre, largest share
+    vec4 anchor            xy in world metres (float32: for patterns, not for geometry)
+    vec4 right, up, ahead  axes of the picture; w of right and up: tangents of half its width and height
+
+Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks and drives), SKY_UNIT
+holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free for drawables are
+units 0 and 1.
+
+A drawable takes part in a pass by
+
+    class Drawable(Protocol):
+        def draw(self, stage: Stage) -> None: ...
+
+drawing itself with its program of that stage: "colour"; "still", the shadows of what stands, drawn anew only
+when the eye has moved on; "moving", the shadows of what moves, drawn for every picture. A drawable that casts no shadow
+of a kind returns at once. Back faces are culled in the picture; front faces are counter-clockwise as in physics.world.mesh.
+"""
+
+from __future__ import annotations
+
+from typing import Final, Literal, NamedTuple, Protocol
+
+import moderngl
+import numpy as np
+
+from cosim.core.geometry import Floats
+from physics.cameras.gl.lighting import Lighting
+from physics.cameras.view import FAR_M, NEAR_M, Shot
+
+Stage = Literal["colour", "still", "moving"]
+
+SCENE_BINDING: Final = 0
+FINISH_UNIT: Final = 2
+SURFACES_UNIT: Final = 3
+FACADES_UNIT: Final = 4
+SKY_UNIT: Final = 5
+STILL_UNIT: Final = 6
+MOVING_UNIT: Final = 7
+ANCHOR_M: Final = 64.0
+
+
+class Drawable(Protocol):
+    """Something that is drawn."""
+
+    def draw(self, stage: Stage) -> None: ...
+
+
+class Programs(NamedTuple):
+    """A drawable's programs: for the picture, and for shadow maps."""
+
+    colour: moderngl.Program
+    shadow: moderngl.Program
+
+    def uniforms(self, name: str) -> list[moderngl.Uniform | None]:
+        """A uniform of both; None where the compiler dropped it."""
+        found = [program.get(name, None) for program in self]
+        return [uniform if isinstance(uniform, moderngl.Uniform) else None for uniform in found]
+
+
+_BLOCK = """#version 430
+layout(std140, binding = 0) uniform Scene {
+    mat4 clip_from_at;
+    mat4 shadow_from_at;
+    vec4 eye;
+    vec4 sun;
+    vec4 sun_light;
+    vec4 side_light;
+    vec4 tilt_light;
+    vec4 flat_light;
+    vec4 fog;
+    vec4 haze;
+    vec4 anchor;
+    vec4 right;
+    vec4 up;
+    vec4 ahead;
+};
+"""
+
+_VERTEX = """
+vec3 unpacked(vec4 normal) { return normal.xyz * (255.0 / 127.0) - 1.0; }
+vec4 project(vec3 at) { return clip_from_at * vec4(at, 1.0); }
+"""
+
+_DECODED = """
+vec3 decoded(vec3 c) { return c * (c * (c * 0.305306011 + 0.682171111) + 0.012522878); }
+"""
+"""sRGB to linear: a cubic that is right to about a level."""
+
+_FRAGMENT = """
+out vec4 pixel;
+layout(binding = 6) uniform sampler2DShadow still_shadow;
+layout(binding = 7) uniform sampler2DShadow moving_shadow;
+
+float sunlit(vec3 at, vec3 normal) {
+#ifdef SHADOWS
+    vec3 in_map = (shadow_from_at * vec4(at + 0.06 * normal, 1.0)).xyz;
+    vec2 off = abs(in_map.xy - 0.5);
+    float inside = clamp((0.5 - max(off.x, off.y)) * 20.0, 0.0, 1.0);
+    float lit = min(texture(still_shadow, in_map), texture(moving_shadow, in_map));
+    return 1.0 - sun.w * inside * (1.0 - lit);
+#else
+    return 1.0;
+#endif
+}
+
+vec3 on_screen(vec3 light) {
+    // Narkowicz's fit of the ACES curve, then sRGB to a level or two.
+    vec3 x = light * sun_light.w;
+    x = min(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0);
+    vec3 s = sqrt(x);
+    return s * (1.1366 - 0.1366 * s);
+}
+
+float fogged() {
+    float far = 1.0 / gl_FragCoord.w;
+    return max(1.0 - exp(-fog.w * far), clamp((far - haze.x) * haze.y, 0.0, haze.z));
+}
+
+void glow(vec3 colour, float label) {
+    pixel = vec4(mix(colour, on_screen(fog.rgb), fogged()), label / 255.0);
+}
+
+void show_linear(vec3 albedo, vec3 own, vec3 normal, vec3 at, float label) {
+    float facing = max(dot(normal, sun.xyz), 0.0);
+    vec3 light = side_light.rgb + normal.z * tilt_light.rgb + abs(normal.z) * flat_light.rgb;
+    light += sun_light.rgb * (facing * sunlit(at, normal));
+    pixel = vec4(on_screen(mix(albedo * light + own, fog.rgb, fogged())), label / 255.0);
+}
+
+void show(vec3 albedo, vec3 normal, vec3 at, float label) {
+    show_linear(decoded(albedo), vec3(0.0), normal, at, label);
+}
+"""
+
+_NOTHING = "#version 430\nvoid main() {}\n"
+
+
+def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: bool) -> Programs:
+    """A drawable's programs: for the picture, and for shadow maps. vertex, fragment: GLSL without a version line.
+
+    shadows: whether `show` looks into the shadow maps.
+    """
+    head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
+    return Programs(
+        context.program(
+            vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=head + _DECODED + _FRAGMENT + fragment
+        ),
+        context.program(vertex_shader=_BLOCK + _DECODED + _VERTEX + vertex, fragment_shader=_NOTHING),
+    )
+
+
+def anchor_of(eye_m: Floats) -> Floats:
+    """(2,) the point of the anchors' lattice nearest to an eye."""
+    return np.round(np.asarray(eye_m[:2]) / ANCHOR_M) * ANCHOR_M
+
+
+def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
+    """(4, 4) from metres relative to the anchor to clip space, the first row of the picture below (read top first)."""
+    wide, tall = shot.half_picture
+    far, near = FAR_M, NEAR_M
+    matrix = np.empty((4, 4))
+    matrix[:3, :3] = shot.axes
+    matrix[3, :3] = matrix[2, :3]
+    matrix[:3, :3] *= ((1.0 / wide,), (-1.0 / tall,), ((far + near) / (far - near),))
+    eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
+    matrix[:, 3] = -matrix[:, :3] @ eye
+    matrix[2, 3] -= 2.0 * far * near / (far - near)
+    return matrix
+
+
+class SceneBlock:
+    """The uniform block of a pass."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._rows = np.zeros((4 + 4 + 12, 4), dtype=np.float32)
+        self._light: Lighting | None = None
+        self._buffer = context.buffer(reserve=self._rows.nbytes)
+
+    def write(self, clip_from_at: Floats, shadow_from_at: Floats, shot: Shot, anchor: Floats, light: Lighting) -> None:
+        """Set it for what is drawn next; matrices (4, 4)."""
+        rows = self._rows
+        if self._light is not light:
+            self._light, rows[9:16] = light, light.rows()
+        rows[:4], rows[4:8] = clip_from_at.T, shadow_from_at.T
+        rows[8, :2], rows[8, 2] = shot.eye_m[:2] - anchor, shot.eye_m[2]
+        rows[16, :2] = anchor
+        rows[17:, :3] = shot.axes
+        rows[17, 3], rows[18, 3] = shot.half_picture
+        self._buffer.write(rows)
+        self.bind()
+
+    def bind(self) -> None:
+        """What is drawn next reads it as it was written last."""
+        self._buffer.bind_to_uniform_block(SCENE_BINDING)
+
+    def release(self) -> None:
+        self._buffer.release()

@@ -1,0 +1,103 @@
+"""Shadow maps: the street as the sun sees it, once for what stands and once for what moves.
+
+Both maps share one box around a point of a coarse lattice near the eye, set to whole texels, so that shadows do not
+swim; what stands is drawn anew only when that point changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import moderngl
+import numpy as np
+
+from cosim.core.geometry import Floats
+from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Stage
+
+REACH_M: Final = 32.0
+"""Half the side of the square that has shadows."""
+STEP_M: Final = 8.0
+"""The lattice of the box's middles."""
+_DEEP_M: Final = 80.0
+_STILL_PX: Final = 2048
+_MOVING_PX: Final = 512
+
+
+def middle_of(eye_m: Floats) -> Floats:
+    """(3,) world metres: the middle of the space with shadows around an eye."""
+    return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
+
+
+def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
+    """(4, 4) from metres relative to the anchor to the clip space of the maps."""
+    sun = to_sun / np.linalg.norm(to_sun)
+    across = np.cross((0.0, 0.0, 1.0), sun)
+    across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
+    rows = np.stack([across, np.cross(sun, across), -sun])
+    texel = 2.0 * REACH_M / _STILL_PX
+    centre = rows @ middle
+    centre[:2] = np.round(centre[:2] / texel) * texel
+    shift = rows @ np.array([*anchor, 0.0]) - centre
+    scale = np.array([1.0 / REACH_M, 1.0 / REACH_M, 1.0 / _DEEP_M])
+    matrix = np.eye(4)
+    matrix[:3, :3], matrix[:3, 3] = rows * scale[:, None], shift * scale
+    return matrix
+
+
+class ShadowMaps:
+    """Two depth pictures from the sun."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self._still, self._moving = (self._texture(pixels) for pixels in (_STILL_PX, _MOVING_PX))
+        self._frames = {
+            "still": context.framebuffer(depth_attachment=self._still),
+            "moving": context.framebuffer(depth_attachment=self._moving),
+        }
+        self._drawn_for: tuple[float, ...] | None = None
+        self._matrix_for: tuple[float, ...] | None = None
+        self._matrix: Floats = np.eye(4)
+
+    def _texture(self, pixels: int) -> moderngl.Texture:
+        texture = self._context.depth_texture((pixels, pixels))
+        texture.compare_func = "<="
+        texture.filter = moderngl.LINEAR, moderngl.LINEAR
+        texture.repeat_x = texture.repeat_y = False
+        return texture
+
+    def matrix(self, middle: Floats, anchor: Floats, light: Lighting) -> Floats:
+        """`shadow_matrix`; the last one is kept."""
+        key = (*middle.tolist(), *anchor.tolist())
+        if key != self._matrix_for:
+            self._matrix_for, self._matrix = key, shadow_matrix(middle, anchor, light.to_sun)
+        return self._matrix
+
+    def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Stage], None]) -> None:
+        """Bring the maps up to date; the scene block must hold their matrix as its camera."""
+        self._context.enable_only(moderngl.DEPTH_TEST)
+        self._context.depth_func = "<"
+        self._context.polygon_offset = 1.5, 4.0
+        key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
+        if key != self._drawn_for:
+            self._draw("still", draw)
+            self._drawn_for = key
+        self._draw("moving", draw)
+        self._context.polygon_offset = 0.0, 0.0
+
+    def _draw(self, stage: Stage, draw: Callable[[Stage], None]) -> None:
+        frame = self._frames[stage]
+        frame.use()
+        frame.clear(depth=1.0)
+        draw(stage)
+
+    def bind(self) -> None:
+        self._still.use(STILL_UNIT)
+        self._moving.use(MOVING_UNIT)
+
+    def release(self) -> None:
+        for frame in self._frames.values():
+            frame.release()
+        self._still.release()
+        self._moving.release()

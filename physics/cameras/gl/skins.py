@@ -1,0 +1,196 @@
+"""Bodies on the graphics card: meshes near, tubes far away, and the shaders that move them with their joints.
+
+A tube's rings are turned towards the eye in the vertex shader, so that a ring of four or six corners has the outline of
+a round one; in shadow maps they are turned towards the sun.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.state import LABELS
+from physics.cameras.gl.shading import Programs, Stage, programs
+from physics.people.body import Body, FarBody
+
+CORNER: Final = np.dtype(
+    [("at", "f4", 3), ("normal", "u1", 4), ("joints", "u1", 4), ("weights", "u1", 4), ("coat", "u1", 4)]
+)
+"""normal: as in corners.CORNER, its fourth how far fat stands out; weights: of 255; coat: row of COATS, three spare."""
+
+FAR_CORNER: Final = np.dtype(
+    [
+        ("middle", "f4", 3),
+        ("ahead", "f4", 3),
+        ("side", "f4", 3),
+        ("ring", "f4", 4),
+        ("joints", "u1", 4),
+        ("weights", "u1", 4),
+        ("coat", "u1", 4),
+    ]
+)
+"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, one spare."""
+
+_MESH_LAYOUT: Final = ("3f4 4f1 4u1 4f1 4u1", "in_at", "in_normal", "in_joints", "in_weights", "in_coat")
+_TUBE_LAYOUT: Final = (
+    "3f4 3f4 3f4 4f4 4u1 4f1 4u1",
+    *("in_middle", "in_ahead", "in_side", "in_ring", "in_joints", "in_weights", "in_coat"),
+)
+_SKIN: Final = """
+layout(binding = 0) uniform sampler2D posed;
+layout(binding = 1) uniform sampler2D dyed;
+in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
+in int person; in float girth;
+out vec3 at; out vec3 normal; flat out vec3 albedo;
+vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
+void pose(int bones) {
+    for (int k = 0; k < bones; k++) {
+        int column = 3 * int(in_joints[k]);
+        x += in_weights[k] * texelFetch(posed, ivec2(column, person), 0);
+        y += in_weights[k] * texelFetch(posed, ivec2(column + 1, person), 0);
+        z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
+    }
+    albedo = texelFetch(dyed, ivec2(int(in_coat.x), person), 0).rgb;
+}
+vec3 moved(vec3 v) { return vec3(dot(x.xyz, v), dot(y.xyz, v), dot(z.xyz, v)); }
+vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
+"""
+
+_MESH: Final = """
+in vec3 in_at; in vec4 in_normal;
+void main() {
+    pose(4);
+    vec3 outward = in_normal.xyz * (255.0 / 127.0) - 1.0;
+    at = placed(in_at + outward * (in_normal.w * girth));
+    normal = moved(outward);
+    gl_Position = project(at);
+}
+"""
+
+_TUBE: Final = """
+in vec3 in_middle; in vec3 in_ahead; in vec3 in_side; in vec4 in_ring;
+void main() {
+    bool still = in_coat.z > 0u;
+    pose(still ? 4 : 2);
+    float share = still ? 1.0 : 1.0 / (in_weights.x + in_weights.y);
+    x *= share; y *= share; z *= share;
+    vec3 middle = placed(in_middle), ahead_ = moved(in_ahead), side = moved(in_side);
+    float stout = float(in_coat.y) / 255.0 * girth;
+    vec2 half_ = vec2(length(ahead_), length(side));
+    ahead_ /= half_.x; side /= half_.y;
+    half_ += stout;
+    vec3 ray = TOWARDS;
+    vec2 across = normalize(vec2(-dot(side, ray), dot(ahead_, ray)) + 1e-7);
+    vec2 way = in_ring.z * across + in_ring.w * vec2(-across.y, across.x);
+    if (still) way = in_ring.zw;
+    if (way.x < 0.0) half_.x *= in_ring.x;
+    // the corner is where the outline of a superellipse has the normal `way`
+    float dual = in_ring.y / (in_ring.y - 1.0);
+    vec2 lean = max(half_ * abs(way), 1e-9);
+    float wide = pow(pow(lean.x, dual) + pow(lean.y, dual), 1.0 / dual);
+    vec2 corner = half_ * sign(way) * pow(lean / wide, vec2(dual - 1.0));
+    at = middle + ahead_ * corner.x + side * corner.y;
+    normal = ahead_ * way.x + side * way.y;
+    gl_Position = project(at);
+}
+"""
+
+_FRAGMENT: Final = f"""
+in vec3 at; in vec3 normal; flat in vec3 albedo;
+void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
+"""
+
+
+class Skins:
+    """Bodies in one vertex and one index buffer; instances: of person and girth."""
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        made: Callable[[int, int], Body | FarBody],
+        drawn: Programs,
+        layout: tuple[str, ...],
+    ) -> None:
+        self._context, self._made, self._drawn, self._layout = context, made, drawn, layout
+        self._rows: list[NDArray[np.void]] = []
+        self._indices: list[NDArray[np.uint32]] = []
+        self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
+        self._arrays: tuple[moderngl.VertexArray, moderngl.VertexArray] | None = None
+
+    def start(self, outfit: int, level: int) -> tuple[int, int, int]:
+        """Take in a body: count of indices, first index, first vertex."""
+        made = self._made(outfit, level)
+        first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
+        self._rows.append(corners(made) if isinstance(made, Body) else far_corners(made))
+        self._indices.append(made.triangles.ravel().astype(np.uint32))
+        self.release()
+        return len(self._indices[-1]), first, base
+
+    def draw(self, stage: Stage, instances: moderngl.Buffer, commands: moderngl.Buffer, count: int, first: int) -> None:
+        """So many indirect draws, from the `first` on."""
+        if not count:
+            return
+        if self._arrays is None:
+            self._bind(instances)
+        assert self._arrays is not None
+        self._arrays[stage != "colour"].render_indirect(commands, moderngl.TRIANGLES, count=count, first=first)
+
+    def release(self) -> None:
+        """Free what is held on the graphics card; it is made anew when needed."""
+        for thing in self._held:
+            thing.release()
+        self._held, self._arrays = [], None
+
+    def _bind(self, instances: moderngl.Buffer) -> None:
+        corner = self._context.buffer(np.concatenate(self._rows).tobytes())
+        index = self._context.buffer(np.concatenate(self._indices).tobytes())
+        content = [(corner, *self._layout), (instances, "1i4 1f4/i", "person", "girth")]
+        colour = self._context.vertex_array(self._drawn.colour, content, index, skip_errors=True)
+        shadow = self._context.vertex_array(self._drawn.shadow, content, index, skip_errors=True)
+        self._held, self._arrays = [colour, shadow, corner, index], (colour, shadow)
+
+
+def mesh_skins(context: moderngl.Context, made: Callable[[int, int], Body], shadows: bool) -> Skins:
+    """Meshes, four joints to a corner."""
+    return Skins(context, made, programs(context, _SKIN + _MESH, _FRAGMENT, shadows), _MESH_LAYOUT)
+
+
+def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody], shadows: bool) -> Skins:
+    """Tubes, two joints to a ring, four to one that is not turned."""
+    seen, cast = (
+        programs(context, f"#define TOWARDS ({ray})\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
+        for ray in ("middle - eye.xyz", "sun.xyz")
+    )
+    return Skins(context, made, Programs(seen.colour, cast.shadow), _TUBE_LAYOUT)
+
+
+def corners(made: Body) -> NDArray[np.void]:
+    """(V,) rows of CORNER."""
+    rows = np.zeros(len(made.vertices), dtype=CORNER)
+    rows["at"] = made.vertices
+    rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
+    rows["normal"][:, 3] = np.rint(255.0 * made.fat)
+    rows["joints"], rows["coat"][:, 0] = made.joints, made.coat
+    rows["weights"] = _bytes(made.weights)
+    return rows
+
+
+def far_corners(made: FarBody) -> NDArray[np.void]:
+    """(V,) rows of FAR_CORNER."""
+    rows = np.zeros(len(made.middle), dtype=FAR_CORNER)
+    rows["middle"], rows["ahead"], rows["side"], rows["ring"] = made.middle, made.ahead, made.side, made.ring
+    rows["joints"], rows["weights"] = made.joints, _bytes(made.weights)
+    rows["coat"][:, 0], rows["coat"][:, 1] = made.coat, np.rint(255.0 * made.fat)
+    rows["coat"][:, 2] = made.still
+    return rows
+
+
+def _bytes(weights: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(V, 4) weights as bytes that sum to 255."""
+    whole = np.rint(255.0 * weights).astype(np.int64)
+    whole[:, 0] += 255 - whole.sum(axis=1)
+    return np.asarray(whole.astype(np.uint8))

@@ -1,0 +1,97 @@
+"""Targets: what a picture is drawn into, and how it is read back.
+
+Colour and label share one texture (the label is its fourth channel), so that a picture is one readback.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Final
+
+import cv2
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import EngineError
+from physics.cameras.view import FAR_M, NEAR_M
+
+
+class Target:
+    """A framebuffer of one size. size: width, height in pixels."""
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
+        self.size = size
+        self._colour = context.renderbuffer(size, 4, dtype="f1")
+        self._depth = context.depth_renderbuffer(size)
+        self.frame = context.framebuffer([self._colour], self._depth)
+
+    def clear(self) -> None:
+        """Nothing is seen, anywhere."""
+        self.use()
+        self.frame.clear(depth=1.0)
+
+    def use(self, labels: bool = True, depth: bool = True) -> None:
+        """Draw into it from now on; what is False keeps what it holds."""
+        self.frame.color_mask, self.frame.depth_mask = (True, True, True, labels), depth
+        self.frame.use()
+
+    def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Colours (H, W, 3) and labels (H, W), the top row first."""
+        return parted(self.frame.read(components=4, dtype="f1"), self.size)
+
+    def read_depth(self) -> NDArray[np.float32]:
+        """Depth along the view, (H, W) metres."""
+        width, height = self.size
+        data = self.frame.read(components=1, attachment=-1, dtype="f4")
+        depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
+        return (FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * depth)).astype(np.float32)
+
+    def release(self) -> None:
+        for thing in (self.frame, self._colour, self._depth):
+            thing.release()
+
+
+class Readback:
+    """Pictures on their way from the graphics card: copied behind one another into a buffer when the card comes to it,
+    fetched later, so that nobody waits for one while the next can be drawn. size: width, height of a picture."""
+
+    UNDER_WAY: Final = 2
+    """Buffers that may have begun and not ended."""
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int], pictures: int = 1) -> None:
+        self._size, self._pictures = size, pictures
+        self._each = size[0] * size[1] * 4
+        self._free = [context.buffer(reserve=self._each * pictures) for _ in range(self.UNDER_WAY)]
+        self._begun: deque[moderngl.Buffer] = deque()
+
+    def begin(self) -> None:
+        """Take a buffer for what is copied next."""
+        if not self._free:
+            raise EngineError("too many pictures are under way: `end` some first")
+        self._begun.append(self._free.pop())
+
+    def copy(self, target: Target, place: int = 0) -> None:
+        """Let the card copy a target to a place in the buffer that began last."""
+        target.frame.read_into(self._begun[-1], components=4, dtype="f1", write_offset=place * self._each)
+
+    def end(self) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+        """The pictures of the buffer that began first, as `Target.read` gives them."""
+        if not self._begun:
+            raise EngineError("no picture is under way: `begin` one first")
+        buffer = self._begun.popleft()
+        data = memoryview(buffer.read())
+        self._free.append(buffer)
+        return [parted(data[i * self._each : (i + 1) * self._each], self._size) for i in range(self._pictures)]
+
+    def release(self) -> None:
+        for buffer in (*self._free, *self._begun):
+            buffer.release()
+
+
+def parted(data: bytes | memoryview, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Colours (H, W, 3) and labels (H, W) of a picture as it was read."""
+    width, height = size
+    whole = np.frombuffer(data, dtype=np.uint8).reshape(height, width, 4)
+    colours, labels = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), cv2.extractChannel(whole, 3)
+    return np.asarray(colours, dtype=np.uint8), np.asarray(labels, dtype=np.uint8)

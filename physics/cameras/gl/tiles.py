@@ -1,0 +1,113 @@
+"""The ground of a tile as one static buffer, uploaded once; its materials are laid over it by world position."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+import moderngl
+
+from cosim.core.geometry import Floats
+from cosim.core.state import LABELS
+from cosim.place.street_map import StreetMap
+from physics.cameras.gl.corners import LAYOUT, corners, joined
+from physics.cameras.gl.shading import Stage
+from physics.cameras.gl.surfaces import Spot, Surfaces, SurfaceShaders
+from physics.street.frontage import frontage_in
+from physics.street.paint import paint_in
+from physics.textures.ground import layer_of
+from physics.world.ground import Ground
+from physics.world.materials import PAVINGS
+from physics.world.mesh import Mesh
+from physics.world.tiles import Tile, surface
+
+_TINTED: Final = 128
+"""Added to the label of a surface whose colour tints its texture."""
+
+_VERTEX: Final = """
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour;
+in vec2 middle; in vec2 middle_in_world;
+out vec3 at; out vec3 normal; out vec2 spot; flat out vec3 tint; flat out vec2 layer_label;
+void main() {
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    float label = in_colour.a * 255.0;
+    at = in_at + vec3(middle, 0.0);
+    normal = unpacked(in_normal);
+    tint = label > 127.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0);
+    float side = layers[layer].w;
+    spot = fract(middle_in_world / side) + in_at.xy / side;
+    layer_label = vec2(layer, label > 127.5 ? label - 128.0 : label);
+    gl_Position = project(at);
+}
+"""
+
+_FRAGMENT: Final = """
+in vec3 at; in vec3 normal; in vec2 spot; flat in vec3 tint; flat in vec2 layer_label;
+void main() {
+    vec4 seen = texture(surfaces, vec3(spot, layer_label.x));
+    vec3 albedo = decoded(seen.rgb) * mix(vec3(1.0), tint, seen.a);
+    show_linear(albedo, vec3(0.0), normal, at, layer_label.y);
+}
+"""
+
+
+def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> SurfaceShaders:
+    """The program of the ground of all tiles."""
+    return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
+
+
+class GroundPart(NamedTuple):
+    """A mesh of one material. layer: its texture; tint: its colour, None for the texture's own."""
+
+    mesh: Mesh
+    layer: str
+    label: str
+    tint: tuple[float, float, float] | None = None
+
+
+def ground_parts(ground: Ground, tile: Tile) -> list[GroundPart]:
+    """The ground of a tile, a part for each of its surfaces; what lies over another is drawn first."""
+    laid = frontage_in(ground.street_map, tile, ground.seed, ground.mapped)
+    found = [GroundPart(mesh, cover.layer, "ground", cover.colour) for mesh, cover in laid]
+    for name, mesh in tile.parts.items():
+        label, colour = surface(name)
+        found.append(GroundPart(mesh, layer_of(name, ground.seed), label, colour if name in PAVINGS else None))
+    return found
+
+
+def paint_parts(street_map: StreetMap, tile: Tile) -> list[GroundPart]:
+    """What lies on the ground of a tile; drawn without labels."""
+    return [GroundPart(mesh, layer, "road") for layer, mesh in paint_in(street_map, tile).items()]
+
+
+class TileBuffers:
+    """Parts of the ground of one tile. middle: (2,) world metres of the tile's."""
+
+    def __init__(
+        self, context: moderngl.Context, shaders: SurfaceShaders, ground: Sequence[GroundPart], middle: Floats
+    ) -> None:
+        parts = []
+        for mesh, layer, label, tint in ground:
+            here = mesh.moved((*-middle, 0.0))
+            rows = corners(here, tint or (0.0, 0.0, 0.0), LABELS[label] + (_TINTED if tint else 0))
+            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
+            parts.append((here, rows))
+        rows, triangles = joined(parts)
+        self._spot = Spot(context, middle)
+        self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
+        content = [(self._corners, *LAYOUT), self._spot.content]
+        self._arrays = [
+            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders.programs
+        ]
+
+    def draw(self, stage: Stage, anchor: Floats) -> None:
+        if stage != "moving":
+            self._spot.seen_from(anchor)
+            self._arrays[stage != "colour"].render()
+
+    def release(self) -> None:
+        for array in self._arrays:
+            array.release()
+        self._corners.release()
+        self._triangles.release()
+        self._spot.release()

@@ -1,0 +1,188 @@
+"""Buildings of a tile as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
+
+What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and which fronts a building has
+hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all along, and
+doors at even distances.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
+from cosim.core.state import LABELS
+from cosim.place.street_map import StreetMap
+from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
+from physics.cameras.gl.surfaces import Spot, Surfaces, SurfaceShaders
+from physics.street.buildings import Building, facade_meshes
+from physics.street.fronts import LEAST_M, face_of, style_of
+from physics.textures.facade_canvas import BAY_M, STOREY_M
+from physics.textures.facades import VARIANTS, WallStyle
+from physics.world.mesh import Mesh
+from physics.world.tiles import CURB_M
+
+_CORNER: Final = np.dtype(
+    [
+        ("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4), ("spot", "f4", 4), ("kind", "u1", 4),
+        ("fronts", "u1", 4),
+    ]
+)  # fmt: skip
+"""normal's fourth: layer of the wall; colour's: 255 where it tints; spot: along and up in metres, in bays and storeys;
+kind: first layer of the upper storeys' windows, storeys, whether it looks to the street, chance;
+fronts: layers of the front and of its bays with doors, 16 times the bays from door to door and the first, chance."""
+_LAYOUT: Final = ("3f 4f1 4f1 4f 4f1 4f1", "in_at", "in_normal", "in_colour", "in_spot", "in_kind", "in_fronts")
+_LIT_SHARE: Final = 0.35
+_LAMPLIGHT: Final = "1.6e-3, 1.2e-3, 0.7e-3"
+"""Radiance of a lit window, in the units of physics.cameras.sky: some 60 candela per square metre."""
+
+_VERTEX: Final = """
+in vec3 in_at; in vec4 in_normal; in vec4 in_colour; in vec4 in_spot; in vec4 in_kind; in vec4 in_fronts;
+in vec2 middle;
+out vec3 at; out vec3 normal; out vec2 spot; out vec2 cells;
+flat out vec4 tint; flat out vec4 kind; flat out vec4 fronts;
+void main() {
+    int layer = int(in_normal.w * 255.0 + 0.5);
+    at = in_at + vec3(middle, 0.0);
+    normal = unpacked(in_normal);
+    tint = vec4(in_colour.a > 0.5 ? tint_of(in_colour.rgb, layer) : vec3(1.0), layer);
+    spot = in_spot.xy / layers[layer].w;
+    cells = in_spot.zw;
+    kind = in_kind * 255.0;
+    fronts = in_fronts * 255.0;
+    gl_Position = project(at);
+}
+"""
+
+_FRAGMENT: Final = f"""
+layout(binding = {FACADES_UNIT}) uniform sampler2DArray facades;
+layout(binding = {FINISH_UNIT}) uniform sampler2DArray finish;
+in vec3 at; in vec3 normal; in vec2 spot; in vec2 cells;
+flat in vec4 tint; flat in vec4 kind; flat in vec4 fronts;
+float chance(vec2 cell, float of) {{
+    vec2 p = fract((cell + of) * vec2(0.1031, 0.1030));
+    p += dot(p, p.yx + 33.33);
+    return fract((p.x + p.y) * p.x);
+}}
+void main() {{
+    vec4 wall = texture(surfaces, vec3(spot, tint.a));
+    vec3 albedo = decoded(wall.rgb) * mix(vec3(1.0), tint.rgb, wall.a);
+    vec2 cell = floor(cells);
+    float drawn = chance(cell, kind.w + 7.0 * fronts.w);
+    bool ground_floor = cell.y < 0.5 && kind.z > 0.5;
+    float every = floor(fronts.z / 16.0);
+    float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
+    float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {VARIANTS}.0);
+    float up = ground_floor ? clamp(cells.y, 0.006, 0.994) : cells.y;  // its plinth does not show over its top
+    vec4 bay = texture(facades, vec3(cells.x, -up, layer));
+    bool none = cell.y < 0.0 || cell.y >= kind.y;
+    albedo = none ? albedo : decoded(bay.rgb) + bay.a * albedo;
+    vec3 own = vec3(0.0);
+#ifdef NIGHT
+    float lit = ground_floor || fract(drawn * 29.0) < {_LIT_SHARE} ? side_light.w : 0.0;
+    vec3 room = vec3(0.25) + 2.5 * decoded(bay.rgb);
+    own = none ? own : vec3({_LAMPLIGHT}) * room * (lit * texture(finish, vec3(cells.x, -cells.y, layer)).g);
+#endif
+    show_linear(albedo, own, normal, at, {LABELS["building"]}.0);
+}}
+"""
+
+
+def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, night: bool) -> SurfaceShaders:
+    """The program of all buildings. night: whether some of their windows are lit."""
+    return SurfaceShaders(context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows)
+
+
+class WallBuffers:
+    """The buildings of one tile. middle: (2,) world metres of the tile's."""
+
+    def __init__(
+        self,
+        context: moderngl.Context,
+        shaders: SurfaceShaders,
+        buildings: Sequence[Building],
+        street_map: StreetMap,
+        middle: Floats,
+    ) -> None:
+        self._spot = Spot(context, middle)
+        parts = [rows for b in buildings for rows in _rows(b, style_of(b, street_map), shaders.surfaces, middle)]
+        self._arrays: list[moderngl.VertexArray] = []
+        self._buffers: list[moderngl.Buffer] = []
+        if not parts:
+            return
+        starts = np.cumsum([0, *(len(rows) for rows, _ in parts)])
+        indices = [triangles.ravel() + start for (_, triangles), start in zip(parts, starts, strict=False)]
+        held = np.concatenate([rows for rows, _ in parts]), np.concatenate(indices).astype(np.uint32)
+        self._buffers = [context.buffer(array.tobytes()) for array in held]
+        content = [(self._buffers[0], *_LAYOUT), self._spot.content]
+        self._arrays = [
+            context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in shaders.programs
+        ]
+
+    def draw(self, stage: Stage, anchor: Floats) -> None:
+        if self._arrays and stage != "moving":
+            self._spot.seen_from(anchor)
+            self._arrays[stage != "colour"].render()
+
+    def release(self) -> None:
+        for array in self._arrays:
+            array.release()
+        for buffer in self._buffers:
+            buffer.release()
+        self._spot.release()
+
+
+def _rows(
+    building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
+) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
+    """Corners and triangles of a building's walls and roof."""
+    face = face_of(building, style)
+    layers, bays = surfaces.surfaces, surfaces.facades
+    wall, roof = layers.index(face.wall), layers.index(face.roof)
+    upper = bays.index(f"{face.upper}-0")
+    fronts = [bays.index(f"{name}-{face.number}") for name in (face.front.between, face.front.door)]
+    doors = 16 * face.front.every + face.first_door
+    colour, chance = face.tint, face.chance
+    street = np.array([np.sin(building.heading_rad), -np.cos(building.heading_rad), 0.0])
+    found = []
+    for facade, mesh in facade_meshes((building,)).items():
+        if facade < 0 or not len(mesh):
+            continue  # windows of the other camera: here they are painted
+        rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
+        rows["at"] = mesh.vertices - np.array([*middle, 0.0])
+        rows["normal"][:, :3] = np.rint(127.0 * mesh.normals) + 127.0
+        flat = mesh.normals[:, 2] > 0.5
+        rows["normal"][:, 3] = np.where(flat, roof, wall)
+        if colour is not None:
+            rows["colour"] = *np.rint(255.0 * np.array(colour)), 255.0
+            rows["colour"][flat] = 0
+        rows["spot"], storeys = _spots(mesh, flat, building.floor_m + CURB_M)
+        # A house of the map may stand on a corner, or in a yard: all its walls have doors.
+        fronted = (mesh.normals @ street > 0.9) | (building.outline is not None)
+        rows["kind"] = np.stack([np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1)
+        rows["fronts"] = *fronts, doors, chance[1]
+        found.append((rows, mesh.triangles))
+    return found
+
+
+def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats, NDArray[np.int64]]:
+    """(V, 4) along and up each wall in metres, in bays and storeys; (V,) storeys with windows, none
+    below the floor."""
+    spots, storeys = np.zeros((len(flat), 4)), np.zeros(len(flat), dtype=np.int64)
+    spots[flat, :2] = mesh.vertices[flat, :2]
+    spots[flat, 3] = -1.0
+    walls = np.flatnonzero(~flat).reshape(-1, 4)  # upright faces are quads: four corners after each other
+    for quad in walls:
+        normal = mesh.normals[quad[0]]
+        along = mesh.vertices[quad] @ np.array([-normal[1], normal[0], 0.0])
+        along -= along.min()
+        up = mesh.vertices[quad, 2] - floor_m
+        width = along.max()
+        count = max(round(width / BAY_M), 1)
+        spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
+        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= LEAST_M and up.max() > 0.0 else 0
+    return spots, storeys

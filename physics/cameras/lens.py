@@ -1,0 +1,229 @@
+"""Lens: what optics and sensor do to a drawn picture, as pure functions of the picture and the robot's state.
+
+In the order of the light: the picture slides while the shutter is open (motion blur) and while rows are read (rolling
+shutter), is bent by the lens, falls off towards the corners, is counted in electrons, and is amplified.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from functools import lru_cache
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import SpecError
+from cosim.core.state import Frame, RobotState
+from cosim.episode.ports import CameraSpec, Lens
+from physics.textures.layers import LINEAR, encoded
+
+GREY: Final = 0.18
+"""Mean linear value that auto-exposure aims at."""
+SAMPLES_MAX: Final = 8
+"""Moments of an open shutter that are averaged; one for each 1.5 pixels that the picture moves, up to these."""
+
+_DRAWN_MAX: Final = 4096
+_OFFSETS: Final = 1 << 18
+_FAR_M: Final = 15.0
+"""What is not the ground is taken to be this far away: the walls of a street."""
+_CODES: Final = (encoded(np.arange(4097) / 4096.0) * 255.0 + 0.5).astype(np.uint8)
+Map = NDArray[np.floating[Any]]
+
+
+def drawn(spec: CameraSpec) -> CameraSpec:
+    """The pinhole camera to draw for a camera with a lens: as sharp in the middle, and wide enough for every pixel.
+
+    Raises SpecError where k1 and k2 fold the picture at this field of view.
+    """
+    lens = spec.lens
+    if lens == Lens():
+        return spec
+    if not (lens.k1 or lens.k2):
+        return dataclasses.replace(spec, lens=Lens())
+    x, y = _rays(spec)
+    focal = _focal_px(spec)
+    width, height = (2 * math.ceil(float(np.abs(m).max()) * focal + 0.5) for m in (x, y))
+    if max(width, height) > _DRAWN_MAX:
+        raise SpecError(
+            f"lens k1 {lens.k1}, k2 {lens.k2}: a picture of {width} x {height} pixels would be drawn for it"
+        )
+    fov = math.degrees(2.0 * math.atan(0.5 * height / focal))
+    return dataclasses.replace(spec, width=width, height=height, fov_deg=fov, lens=Lens())
+
+
+def through(spec: CameraSpec, frame: Frame, robot: RobotState, seed: int, tick: int) -> Frame:
+    """The frame of a camera with a lens, from the frame of `drawn(spec)`. Labels and depth are only moved.
+
+    robot: the source of motion blur and skew; seed, tick: of the noise. Motion is that of the ground plane below and
+    of walls beside; people and vehicles blur as if they stood still.
+    """
+    lens = spec.lens
+    if lens == Lens():
+        return frame
+    source = drawn(spec)
+    size = (source.height, source.width)
+    if frame.rgb.shape[:2] != size:
+        raise SpecError(f"the lens needs a frame of {size[1]} x {size[0]} pixels, as drawn(spec) says")
+    rgb = frame.rgb
+    toned = bool(lens.full_well_e or lens.auto_exposure_ev or lens.vignette)
+    labels, depth = frame.labels, frame.depth
+    moving = (lens.shutter_s > 0.0 or lens.readout_s > 0.0) and (robot.v_mps != 0.0 or robot.w_radps != 0.0)
+    light: NDArray[np.floating[Any]] | None = None
+    if moving or lens.k1 or lens.k2:
+        flow = _flow(spec, robot) if moving else None
+        moments = _moments(spec, flow)
+        read = (np.arange(spec.height, dtype=np.float32)[:, None] + 0.5) / spec.height - 0.5
+        read = read * np.float32(lens.readout_s)
+        labels = None if labels is None else _moved(labels, spec, source, flow, read, cv2.INTER_NEAREST)
+        depth = None if depth is None else _moved(depth, spec, source, flow, read, cv2.INTER_NEAREST)
+        if len(moments) == 1:
+            rgb = _moved(rgb, spec, source, flow, read, cv2.INTER_LINEAR)
+        else:
+            open_ = LINEAR[rgb]
+            light = np.zeros((spec.height, spec.width, 3), np.float32)
+            for moment in moments:
+                light += _moved(open_, spec, source, flow, read + moment, cv2.INTER_LINEAR)
+            light /= np.float32(len(moments))
+    if toned:
+        light = _sensed(LINEAR[rgb] if light is None else light, spec, seed, tick)
+    if light is not None:
+        rgb = _CODES[(np.clip(light, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.int16)]
+    return Frame(rgb, labels, depth)
+
+
+def exposure_gain(light: NDArray[np.floating[Any]], range_ev: float) -> float:
+    """What auto-exposure multiplies a linear picture (H, W, 3) by: its mean to GREY, within +-`range_ev` stops.
+
+    It meters the picture itself and remembers nothing, so that a picture stays a function of the state.
+    """
+    mean = float(light.mean(axis=(0, 1)) @ np.array([0.2126, 0.7152, 0.0722]))
+    return float(np.clip(GREY / max(mean, 1e-6), 2.0**-range_ev, 2.0**range_ev))
+
+
+def _sensed(light: NDArray[np.floating[Any]], spec: CameraSpec, seed: int, tick: int) -> NDArray[np.floating[Any]]:
+    """Fall of light, noise of the sensor, amplification; linear in and out. The gain amplifies the noise too."""
+    lens = spec.lens
+    if lens.vignette:
+        light = light * _falloff(spec)[..., None]
+    gain = exposure_gain(light, lens.auto_exposure_ev) if lens.auto_exposure_ev else 1.0
+    if lens.full_well_e:
+        start = int(np.random.default_rng([seed, tick]).integers(_OFFSETS))
+        noise = _noise(seed, light.size)[start : start + light.size].reshape(light.shape)
+        dark = np.float32((lens.read_noise_e / lens.full_well_e) ** 2)
+        light = light + np.sqrt(light * np.float32(1.0 / lens.full_well_e) + dark) * noise
+    return light * np.float32(gain)
+
+
+def _moments(spec: CameraSpec, flow: Map | None) -> list[float]:
+    """Times at which an open shutter is looked through, around 0."""
+    if flow is None or not spec.lens.shutter_s:
+        return [0.0]
+    pixels = float(np.abs(flow).max()) * _focal_px(spec) * spec.lens.shutter_s
+    n = min(max(math.ceil(pixels / 1.5), 1), SAMPLES_MAX)
+    return [((k + 0.5) / n - 0.5) * spec.lens.shutter_s for k in range(n)]
+
+
+def _moved(
+    picture: NDArray[Any], spec: CameraSpec, source: CameraSpec, flow: Map | None, time_s: Map, how: int
+) -> NDArray[Any]:
+    """A source picture as the lens shows it, each row at its time; `time_s` (H, 1)."""
+    if flow is None:
+        one, two = _still(spec, source, how)
+    else:
+        x, y = _rays(spec)
+        one, two = _pixels(spec, source, x - flow[..., 0] * time_s, y - flow[..., 1] * time_s)
+    return np.asarray(cv2.remap(picture, one, two, how, borderMode=cv2.BORDER_REPLICATE))
+
+
+def _pixels(spec: CameraSpec, source: CameraSpec, x: Map, y: Map) -> tuple[Map, Map]:
+    """Columns and rows in the source picture of rays (H, W)."""
+    focal = np.float32(_focal_px(spec))
+    return x * focal + np.float32(0.5 * source.width - 0.5), y * focal + np.float32(0.5 * source.height - 0.5)
+
+
+@lru_cache(maxsize=8)
+def _still(spec: CameraSpec, source: CameraSpec, how: int) -> tuple[NDArray[Any], NDArray[Any]]:
+    """The lens alone, as OpenCV's fixed-point maps, which it reads faster."""
+    whole: tuple[NDArray[Any], NDArray[Any]] = cv2.convertMaps(
+        *_pixels(spec, source, *_rays(spec)), cv2.CV_16SC2, nninterpolation=how == cv2.INTER_NEAREST
+    )
+    return whole
+
+
+def _focal_px(spec: CameraSpec) -> float:
+    return 0.5 * spec.height / math.tan(math.radians(0.5 * spec.fov_deg))
+
+
+@lru_cache(maxsize=8)
+def _rays(spec: CameraSpec) -> tuple[Map, Map]:
+    """(H, W) x to the right and y down, in focal lengths, of the ray that each pixel of the lens sees.
+
+    D. C. Brown, Photogrammetric Engineering 37 (1971): r' = r (1 + k1 r^2 + k2 r^4), solved for r by Newton's method.
+    """
+    focal = _focal_px(spec)
+    x, y = np.meshgrid(
+        (np.arange(spec.width) + 0.5 - 0.5 * spec.width) / focal,
+        (np.arange(spec.height) + 0.5 - 0.5 * spec.height) / focal,
+    )
+    k1, k2 = spec.lens.k1, spec.lens.k2
+    if k1 or k2:
+        bent = np.hypot(x, y)
+        r = bent.copy()
+        for _ in range(30):
+            r -= (r * (1.0 + k1 * r**2 + k2 * r**4) - bent) / (1.0 + 3.0 * k1 * r**2 + 5.0 * k2 * r**4)
+        out = np.linspace(0.0, float(np.abs(r).max()) if np.isfinite(r).all() else 1e3, 200)
+        if np.any(1.0 + 3.0 * k1 * out**2 + 5.0 * k2 * out**4 <= 0.0):
+            raise SpecError(
+                f"lens k1 {k1}, k2 {k2} fold the picture over itself within a field of view of {spec.fov_deg:g} deg at "
+                f"{spec.width} x {spec.height}: give a narrower fov_deg or terms nearer to 0"
+            )
+        scale = np.where(bent > 1e-9, r / np.maximum(bent, 1e-9), 1.0)
+        x, y = x * scale, y * scale
+    return _locked(x), _locked(y)
+
+
+@lru_cache(maxsize=2)
+def _noise(seed: int, size: int) -> Map:
+    """Normal noise of a scenario: each picture takes `size` values of it from a place of its own."""
+    return _locked(np.random.default_rng([seed, 0x1E45]).standard_normal(size + _OFFSETS, dtype=np.float32))
+
+
+@lru_cache(maxsize=8)
+def _falloff(spec: CameraSpec) -> Map:
+    """(H, W) light that arrives: 1 in the middle, cos^4 of the angle off the axis at a vignette of 1."""
+    x, y = _rays(spec)
+    return _locked(1.0 - spec.lens.vignette * (1.0 - (1.0 + x**2 + y**2) ** -2.0))
+
+
+@lru_cache(maxsize=8)
+def _flows(spec: CameraSpec) -> tuple[Map, Map]:
+    """(H, W, 2) how the picture moves, in focal lengths a second: per m/s ahead, and per rad/s to the left.
+
+    H. C. Longuet-Higgins and K. Prazdny, Proc. R. Soc. B 208 (1980), over a ground plane and walls at _FAR_M.
+    """
+    x, y = (m.astype(float) for m in _rays(spec))
+    down = math.radians(spec.pitch_down_deg)
+    near = np.maximum((y * math.cos(down) + math.sin(down)) / max(spec.mount_m[2], 0.05), 1.0 / _FAR_M)
+    ahead = np.array([0.0, -math.sin(down), math.cos(down)])
+    up = np.array([0.0, -math.cos(down), -math.sin(down)])
+    swing = -spec.mount_m[1] * ahead + np.array([-spec.mount_m[0], 0.0, 0.0])
+    rays = np.stack([x, y, np.ones_like(x)], axis=-1)
+    flows = []
+    for speed, turn in ((ahead, np.zeros(3)), (swing, up)):
+        moved = -speed * near[..., None] - np.cross(turn, rays)
+        flows.append(_locked(moved[..., :2] - rays[..., :2] * moved[..., 2:]))
+    return flows[0], flows[1]
+
+
+def _flow(spec: CameraSpec, robot: RobotState) -> Map:
+    ahead, turn = _flows(spec)
+    return ahead * np.float32(robot.v_mps) + turn * np.float32(robot.w_radps)
+
+
+def _locked(field: NDArray[np.floating[Any]]) -> Map:
+    whole = np.ascontiguousarray(field, dtype=np.float32)
+    whole.flags.writeable = False
+    return whole

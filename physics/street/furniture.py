@@ -1,0 +1,195 @@
+"""The catalogue of street furniture: a literal table of parametric props, and the prop that stands somewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Final, Literal
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from physics.street import furniture_shapes as shapes
+from physics.street.furniture_shapes import METAL, WOOD, Colour, Part, Size, Solid
+
+Zone = Literal["verge", "curb", "frontage", "driveway"]
+"""Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there is no verge;
+between sidewalk and buildings; in the frontage at the end of a driveway."""
+
+VARIANTS: Final = 3
+"""Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a shape."""
+
+LEAVES: Final = ((0.22, 0.42, 0.17), (0.30, 0.48, 0.18), (0.18, 0.36, 0.22), (0.42, 0.46, 0.17))
+SIGNS: Final = ((0.12, 0.30, 0.66), (0.80, 0.12, 0.10), (0.95, 0.80, 0.12), (0.90, 0.90, 0.90))
+HYDRANTS: Final = ((0.80, 0.13, 0.10), (0.90, 0.70, 0.10))
+BINS: Final = ((0.16, 0.33, 0.22), (0.30, 0.31, 0.33), (0.16, 0.25, 0.42))
+SCOOTERS: Final = ((0.20, 0.72, 0.36), (0.90, 0.42, 0.10), (0.12, 0.12, 0.13))
+CARTONS: Final = ((0.68, 0.52, 0.34), (0.60, 0.45, 0.30), (0.36, 0.42, 0.50))
+CHAIRS: Final = ((0.70, 0.20, 0.16), (0.22, 0.34, 0.50), (0.30, 0.42, 0.26), (0.60, 0.44, 0.28))
+FENCES: Final = ((0.88, 0.42, 0.08), (0.80, 0.12, 0.10))
+CARS: Final = ((0.86, 0.86, 0.87), (0.12, 0.13, 0.15), (0.55, 0.57, 0.60), (0.62, 0.11, 0.12), (0.13, 0.24, 0.48))
+ROOFS: Final = ((0.24, 0.26, 0.28), (0.16, 0.30, 0.28))
+PLANTS: Final = ((0.30, 0.46, 0.20), (0.24, 0.40, 0.18), (0.55, 0.34, 0.40), (0.50, 0.50, 0.22))
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """An entry of the catalogue.
+
+    sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how many a street of a
+    class has along 100 m of one sidewalk. row: stands in a row, evenly spaced. spread_m: radius of what is above
+    the heads and may hang over a sidewalk, not into a house. seen_m: farthest it is drawn. grown: its parts differ
+    from paint to paint.
+    """
+
+    name: str
+    sizes_m: tuple[Size, Size]
+    zones: tuple[Zone, ...]
+    per_100m: Mapping[str, float]
+    solids: Callable[[Size], tuple[Solid, ...]]
+    parts: Callable[..., tuple[Part, ...]]
+    paints: tuple[Colour, ...]
+    row: bool = False
+    spread_m: float = 0.0
+    seen_m: float = 30.0
+    grown: bool = False
+
+    def size_m(self, variant: int) -> Size:
+        low, high = np.array(self.sizes_m)
+        length, depth, height = (low + (high - low) * variant / (VARIANTS - 1)).tolist()
+        return length, depth, height
+
+
+def _along(residential: float, commercial: float, avenue: float, boulevard: float, narrow: float) -> dict[str, float]:
+    return {
+        "residential": residential, "commercial": commercial, "avenue": avenue, "boulevard": boulevard,
+        "ring": 0.5 * avenue, "narrow": narrow,
+    }  # fmt: skip
+
+
+CATALOGUE: Final[tuple[Kind, ...]] = (
+    Kind(
+        "shelter", ((2.8, 1.2, 2.3), (4.0, 1.5, 2.5)), ("verge", "frontage"), _along(0.0, 0.4, 0.7, 0.6, 0.0),
+        shapes.three_walls, shapes.shelter, ROOFS, spread_m=0.2, seen_m=50.0,
+    ),
+    Kind(
+        "car", ((3.8, 1.7, 1.45), (4.6, 1.9, 1.45)), ("driveway",), _along(1.0, 0.4, 0.2, 0.2, 0.3),
+        shapes.block, shapes.car, CARS, seen_m=50.0,
+    ),
+    Kind(
+        "tree", ((0.2, 0.2, 4.6), (0.4, 0.4, 7.5)), ("verge", "frontage"), _along(5.0, 2.5, 4.5, 7.0, 0.0),
+        shapes.upright, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0, grown=True,
+    ),
+    Kind(
+        "lamp", ((0.12, 0.12, 4.5), (0.16, 0.16, 7.0)), ("verge", "curb", "frontage"), _along(3.0, 4.0, 3.6, 3.6, 2.5),
+        shapes.upright, shapes.lamp, (METAL, (0.16, 0.24, 0.20), (0.45, 0.46, 0.47)), row=True, seen_m=50.0,
+    ),
+    Kind(
+        "fence", ((2.2, 0.4, 1.9), (4.0, 0.4, 2.1)), ("frontage",), _along(0.25, 0.35, 0.3, 0.2, 0.1),
+        shapes.block, shapes.fence, FENCES, seen_m=40.0,
+    ),
+    Kind(
+        "cafe", ((1.75, 0.6, 0.85), (1.95, 0.75, 0.85)), ("frontage",), _along(0.1, 3.0, 1.0, 2.0, 0.3),
+        shapes.table_and_chairs, shapes.cafe, CHAIRS,
+    ),
+    Kind(
+        "bench", ((1.4, 0.45, 0.85), (1.9, 0.55, 0.9)), ("verge", "frontage"), _along(0.8, 1.6, 1.2, 2.2, 0.1),
+        shapes.block, shapes.bench, (WOOD, (0.40, 0.42, 0.40)),
+    ),
+    Kind(
+        "rack", ((0.75, 0.6, 0.8), (1.5, 0.75, 0.85)), ("verge", "frontage"), _along(0.4, 1.5, 0.7, 0.9, 0.1),
+        shapes.hoops, shapes.rack, ((0.60, 0.62, 0.64), (0.20, 0.22, 0.24)),
+    ),
+    Kind(
+        "planter", ((0.7, 0.35, 0.8), (1.5, 0.5, 1.0)), ("frontage", "verge"), _along(1.5, 2.2, 0.8, 1.8, 1.2),
+        shapes.block, shapes.planter, PLANTS,
+    ),
+    Kind(
+        "bin", ((0.42, 0.42, 0.9), (0.56, 0.56, 1.05)), ("verge", "frontage"), _along(1.2, 1.8, 1.0, 1.4, 0.4),
+        shapes.upright, shapes.litter_bin, BINS,
+    ),
+    Kind(
+        "scooter", ((1.15, 0.45, 1.1), (1.2, 0.5, 1.15)), ("verge", "frontage"), _along(0.5, 1.6, 0.8, 0.8, 0.3),
+        shapes.block, shapes.scooter, SCOOTERS,
+    ),
+    Kind(
+        "boxes", ((0.7, 0.4, 0.6), (1.3, 0.6, 1.1)), ("frontage",), _along(0.5, 0.9, 0.4, 0.2, 0.5),
+        shapes.block, shapes.boxes, CARTONS,
+    ),
+    Kind(
+        "hydrant", ((0.28, 0.28, 0.7), (0.32, 0.32, 0.8)), ("verge", "frontage"), _along(0.7, 0.6, 0.6, 0.6, 0.3),
+        shapes.upright, shapes.hydrant, HYDRANTS,
+    ),
+    Kind(
+        "sign", ((0.06, 0.06, 2.5), (0.08, 0.08, 2.8)), ("verge", "curb"), _along(1.6, 2.2, 2.0, 1.6, 1.6),
+        shapes.upright, shapes.sign, SIGNS, seen_m=40.0,
+    ),
+    Kind(
+        "bollard", ((0.12, 0.12, 0.75), (0.18, 0.18, 1.0)), ("verge", "curb"), _along(0.5, 2.0, 0.6, 1.0, 4.0),
+        shapes.upright, shapes.bollard, (METAL, (0.72, 0.60, 0.16)), row=True,
+    ),
+)  # fmt: skip
+"""In the order in which they find a place: the large first."""
+
+KINDS: Final[Mapping[str, Kind]] = {kind.name: kind for kind in CATALOGUE}
+
+
+@dataclass(frozen=True, slots=True)
+class Prop:
+    """A thing that stands on the street. heading_rad: of its x axis; paint: index of its kind's paints.
+
+    turned_rad: what is drawn of it is turned further by so much; what is bumped into is not.
+    """
+
+    id: str
+    kind: str
+    variant: int
+    x_m: float
+    y_m: float
+    heading_rad: float
+    paint: int
+    turned_rad: float = 0.0
+
+    @property
+    def size_m(self) -> Size:
+        return KINDS[self.kind].size_m(self.variant)
+
+    @property
+    def form(self) -> tuple[str, int, int]:
+        """What `parts_of` takes: props with equal forms are drawn with the same meshes."""
+        return self.kind, self.variant, self.paint if KINDS[self.kind].grown else 0
+
+    @property
+    def drawn_rad(self) -> float:
+        """Heading of what is drawn."""
+        return self.heading_rad + self.turned_rad
+
+
+def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:
+    """(N,) rectangles of ground that props cover, grown by a margin."""
+    if not props:
+        return np.zeros(0, dtype=object)
+    half = 0.5 * np.array([prop.size_m[:2] for prop in props]) + margin_m
+    heading = np.array([prop.heading_rad for prop in props])
+    along = half[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
+    aside = half[:, 1:] * np.column_stack([-np.sin(heading), np.cos(heading)])
+    middle = np.array([(prop.x_m, prop.y_m) for prop in props])
+    corners = np.stack([-along - aside, along - aside, along + aside, aside - along], axis=1)
+    return np.asarray(shapely.polygons(middle[:, None] + corners), dtype=object)
+
+
+@cache
+def parts_of(kind: str, variant: int, look: int = 0) -> tuple[Part, ...]:
+    """What is drawn of a prop. look: tells apart those of one size, where a kind is `grown`."""
+    entry = KINDS[kind]
+    size = entry.size_m(variant)
+    return entry.parts(size, look) if entry.grown else entry.parts(size)
+
+
+@cache
+def solids_of(kind: str, variant: int) -> tuple[Solid, ...]:
+    """What is bumped into of a prop."""
+    entry = KINDS[kind]
+    return entry.solids(entry.size_m(variant))

@@ -1,0 +1,132 @@
+"""What the map itself shows beside its streets, as buildings and props: cut by tiles, found by place.
+
+Where it shows something, nothing of the kind is made up: see `shows`.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections import defaultdict
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+
+from cosim.place import overlay
+from cosim.place.street_map import Feature, StreetMap
+from cosim.place.terrain import Terrain
+from physics.street.buildings import FACADES, Building, Wall
+from physics.street.furniture import KINDS, VARIANTS, Prop
+from physics.world.tiles import Key, key_at, square
+
+HOUSES_M: Final = 30.0
+THINGS_M: Final = 40.0
+"""So near to a building of the map no building is made up, and so near to a thing of the map none of its kind."""
+_SPLINTER_M2: Final = 0.05
+
+
+class MappedThings:
+    """The features of a street map for the engines; a pure function of the map. kinds: of the things it shows."""
+
+    def __init__(self, street_map: StreetMap) -> None:
+        by_kind: dict[str, list[Feature]] = defaultdict(list)
+        for feature in street_map.features:
+            by_kind[feature.kind].append(feature)
+        self._houses = by_kind.pop("building", [])
+        self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
+        self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
+        self._trees = {
+            kind: shapely.STRtree([shapely.Point(f.x_m, f.y_m) for f in features]) for kind, features in by_kind.items()
+        }
+        self._trees["building"] = self._house_tree
+        self.kinds = frozenset(by_kind)
+        self._props: dict[Key, list[Prop]] = defaultdict(list)
+        for i, feature in enumerate(f for f in street_map.features if f.kind != "building"):
+            self._props[key_at(feature.x_m, feature.y_m)].append(_prop(i, feature))
+
+    @property
+    def all_props(self) -> tuple[Prop, ...]:
+        """Things of every tile."""
+        return tuple(prop for props in self._props.values() for prop in props)
+
+    def props(self, key: Key) -> Sequence[Prop]:
+        """Things whose middle lies in a tile."""
+        return self._props.get(key, ())
+
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """The parts of buildings that lie in a tile, each a building of its own."""
+        tile = shapely.box(*square(key))
+        found = []
+        for i in np.sort(self._house_tree.query(tile, predicate="intersects")).tolist():
+            parts = shapely.get_parts(overlay.intersection(self._houses[i].polygon, tile))
+            solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
+            found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
+        return tuple(found)
+
+    def houses(self, area: shapely.Geometry) -> list[Polygon]:
+        """Outlines of the buildings that touch an area."""
+        return [self._houses[i].polygon for i in np.sort(self._house_tree.query(area, predicate="intersects")).tolist()]
+
+    def shows(self, kind: str, place: shapely.Geometry) -> bool:
+        """Whether the map shows things of a kind near a place, so that none need be made up there."""
+        tree = self._trees.get(kind)
+        reach = HOUSES_M if kind == "building" else THINGS_M
+        return tree is not None and bool(len(tree.query(place, predicate="dwithin", distance=reach)))
+
+
+def _prop(number: int, feature: Feature) -> Prop:
+    """The size nearest to the mapped height, else one drawn by number; the same for the paint."""
+    kind = KINDS[feature.kind]
+    drawn = zlib.crc32(f"{feature.kind}:{number}".encode())
+    variant = drawn % VARIANTS
+    if feature.height_m > 0.0:
+        variant = min(range(VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
+    paint = drawn // VARIANTS % len(kind.paints)
+    turned = number % 7 * 0.9 if kind.grown else 0.0
+    return Prop(
+        f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint, turned
+    )
+
+
+def _floor_m(whole: Polygon, terrain: Terrain | None) -> float:
+    """The floor of a house: as high as the land around it, on average."""
+    if terrain is None:
+        return 0.0
+    return float(terrain.height(shapely.get_coordinates(shapely.segmentize(whole.exterior, 1.0))).mean())
+
+
+def _building(number: int, house: Feature, part: Polygon, floor_m: float) -> Building:
+    """A part of a mapped building, in the box around it along its street; all parts of one bear its name and look."""
+    part = shapely.orient_polygons(part)
+    cos, sin = math.cos(house.heading_rad), math.sin(house.heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    corners = shapely.get_coordinates(part) @ turn
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    x, y = (turn @ (0.5 * (low + high))).tolist()
+    length, deep = (high - low).tolist()
+    return Building(
+        id=f"building:map:{number}",
+        x_m=x,
+        y_m=y,
+        heading_rad=house.heading_rad,
+        size_m=(length, deep, house.height_m),
+        facade=zlib.crc32(f"{number}:{house.x_m:.2f}".encode()) % len(FACADES),
+        outline=part,
+        walls=_walls(part, house.polygon),
+        floor_m=floor_m,
+        base_m=floor_m,
+    )
+
+
+def _walls(part: Polygon, whole: Polygon) -> tuple[Wall, ...]:
+    """The sides of a part that are sides of the whole, the outside to their right; cuts between tiles are none."""
+    sides = []
+    for ring in (part.exterior, *part.interiors):
+        xy = shapely.get_coordinates(ring)
+        sides += list(zip(xy[:-1].tolist(), xy[1:].tolist(), strict=True))
+    middles = shapely.points(np.array(sides).mean(axis=1))
+    outer = shapely.dwithin(middles, whole.boundary, 1e-3)
+    return tuple((*a, *b) for (a, b), is_wall in zip(sides, outer, strict=True) if is_wall and a != b)

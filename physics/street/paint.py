@@ -1,0 +1,179 @@
+"""Paint and tactile paving: what lies on the ground without changing what the ground is.
+
+Lines between lanes and between the directions of a road, stop lines before signalised crossings, and fields of domes
+where a crossing begins. Lines belong to the tile of their middle and follow its heights; domes lie in the triangles of
+the ground, of whichever tile.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats, Polyline
+from cosim.place.street_map import Lane, StreetMap, Strip
+from physics.world.mesh import EMPTY, Mesh, join
+from physics.world.tiles import Tile, key_at, kind_of, square
+
+LINE_M: Final = 0.12
+STOP_LINE_M: Final = 0.40
+TACTILE_M: Final = 0.60
+"""Depth of a field of domes, along the way over the crossing."""
+_DASH_M: Final = (3.0, 6.0)
+_CENTRE_DASH_M: Final = (3.0, 3.0)
+"""Length of a dash, and of the gap after it."""
+_PIECE_M: Final = 1.0
+_STOP_BEFORE_M: Final = 0.5
+_STOP_WITHIN_M: Final = 12.0
+_TACTILE_BEHIND_M: Final = 0.25
+_LIFT_M: Final = 0.004
+_REACH_M: Final = 8.0
+_WALKED_ON: Final = ("sidewalk", "ramp", "curb")
+"""Kinds of ground that domes lie on."""
+
+
+def paint_in(street_map: StreetMap, tile: Tile) -> Mapping[str, Mesh]:
+    """What lies on a tile, by the name of its ground layer; 4 mm above the ground."""
+    x0, y0, x1, y1 = square(tile.key)
+    reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
+    lanes = [lane for lane in street_map.near("lane", reach) if isinstance(lane, Lane)]
+    roads = [lane for lane in lanes if lane.kind == "road" and not lane.internal]
+    strips = [strip for strip in street_map.near("strip", reach) if isinstance(strip, Strip)]
+    crossings = [strip for strip in strips if strip.kind == "crossing"]
+    lines = [quad for lane in roads for quad in _lines(street_map, lane)]
+    lines += [quad for lane in roads for quad in _stop_line(lane, crossings)]
+    found = {"paint": _laid([np.asarray(quad) for quad in lines], tile)}
+    found["tactile-domes"] = _fields(street_map, crossings, tile)
+    return {name: mesh for name, mesh in found.items() if len(mesh)}
+
+
+def _lines(street_map: StreetMap, lane: Lane) -> Iterator[Floats]:
+    """Quads (4, 2) along the inner side of a lane: dashes to the next lane, or to the other direction."""
+    side = -1.0 if street_map.left_hand else 1.0
+    edge, _, index = lane.id.rpartition("_")
+    beside = street_map.lanes.get(f"{edge}_{int(index) + 1}") if index.isdecimal() else None
+    if beside is not None and beside.kind == "road":
+        dash = _DASH_M
+    elif _meets(street_map, lane, side, f"-{edge}"):
+        dash = _CENTRE_DASH_M
+    else:
+        return
+    line = Polyline(lane.line)
+    end_m = line.length_m - 1.0
+    for start in np.arange(0.5, end_m, sum(dash)):
+        stop = min(start + dash[0], end_m)
+        count = max(math.ceil((stop - start) / _PIECE_M), 1)
+        cuts = np.linspace(start, stop, count + 1)
+        yield from _band(line, cuts, side * 0.5 * lane.width_m, LINE_M)
+
+
+def _meets(street_map: StreetMap, lane: Lane, side: float, edge: str) -> bool:
+    """Whether another road's lanes lie right beside a lane, no verge between them. side: 1 left, -1 right."""
+    line = Polyline(lane.line)
+    x, y, heading = line.at(0.5 * line.length_m)
+    aside = side * (0.5 * lane.width_m + 0.3)
+    spot = shapely.Point(x - aside * math.sin(heading), y + aside * math.cos(heading))
+    return any(isinstance(piece, Lane) and piece.edge == edge for piece in street_map.near("lane", spot))
+
+
+def _stop_line(lane: Lane, crossings: Sequence[Strip]) -> Iterator[Floats]:
+    """Quads across a lane where it ends before a signalised crossing."""
+    end = shapely.Point(lane.line[-1])
+    for crossing in crossings:
+        if crossing.signalised and lane.edge in crossing.crosses and end.distance(crossing.polygon) < _STOP_WITHIN_M:
+            line = Polyline(lane.line)
+            at_m = min(line.length_m, _before(line, crossing)) - _STOP_BEFORE_M
+            if at_m > 1.0:
+                yield from _band(line, np.array([at_m - STOP_LINE_M, at_m]), 0.0, lane.width_m - 0.2)
+            return
+
+
+def _before(line: Polyline, crossing: Strip) -> float:
+    """Arc length at which a lane meets a crossing; infinite where it ends first."""
+    met = shapely.intersection(shapely.LineString(line.points), crossing.polygon)
+    if shapely.is_empty(met):
+        return math.inf
+    along = shapely.line_locate_point(shapely.LineString(line.points), shapely.points(shapely.get_coordinates(met)))
+    return float(np.min(along))
+
+
+def _band(line: Polyline, cuts: Floats, aside_m: float, width_m: float) -> Iterator[Floats]:
+    """Quads (4, 2) between arc lengths, `aside_m` to the left of a line."""
+    rows = []
+    for s in cuts.tolist():
+        x, y, heading = line.at(s)
+        left = np.array([-math.sin(heading), math.cos(heading)])
+        middle = np.array([x, y]) + aside_m * left
+        rows.append((middle - 0.5 * width_m * left, middle + 0.5 * width_m * left))
+    for (right0, left0), (right1, left1) in pairwise(rows):
+        yield np.stack([right0, right1, left1, left0])
+
+
+def _laid(quads: Sequence[Floats], tile: Tile) -> Mesh:
+    """Quads (4, 2) whose middle is in the tile, on its ground."""
+    own = [quad for quad in quads if key_at(*quad.mean(axis=0).tolist()) == tile.key]
+    if not own:
+        return EMPTY
+    xy = np.concatenate(own)
+    first = 4 * np.arange(len(own))[:, None]
+    triangles = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
+    return _on_ground(xy, triangles, tile)
+
+
+def _on_ground(xy: Floats, triangles: NDArray[np.int64], tile: Tile) -> Mesh:
+    up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
+    return Mesh(np.column_stack([xy, tile.height(xy) + _LIFT_M]), up, np.asarray(triangles, dtype=np.int32))
+
+
+def _fields(street_map: StreetMap, crossings: Sequence[Strip], tile: Tile) -> Mesh:
+    """Domes at both ends of the crossings, on walkable ground only: what of them lies on the tile."""
+    border = shapely.box(*square(tile.key))
+    ends = [(line, one.width_m) for one in crossings for line in (one.line, one.line[::-1])]
+    fields = [_field(street_map, Polyline(line), width_m) for line, width_m in ends]
+    here = [field for field in fields if shapely.intersects(field, border)]
+    if not here:
+        return EMPTY
+    walked = join([mesh for name, mesh in tile.parts.items() if kind_of(name) in _WALKED_ON])
+    return join([_draped(field, walked) for field in here])
+
+
+def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
+    """A field cut along the triangles of the ground under it, so that it lies in them; 4 mm above."""
+    faces = ground.vertices[ground.triangles]
+    normal = np.cross(faces[:, 1] - faces[:, 0], faces[:, 2] - faces[:, 0])
+    x0, y0, x1, y1 = shapely.bounds(field)
+    low, high = faces[:, :, :2].min(axis=1), faces[:, :, :2].max(axis=1)
+    near = (normal[:, 2] > 1e-9) & ((low < (x1, y1)) & (high > (x0, y0))).all(axis=1)
+    faces, normal = faces[near], normal[near]
+    pieces = shapely.intersection(shapely.polygons(faces[:, :, :2]), field)
+    own = shapely.area(pieces) > 1e-6
+    faces, normal = faces[own], normal[own]
+    cut, of = shapely.get_parts(shapely.constrained_delaunay_triangles(pieces[own]), return_index=True)
+    xy = shapely.get_coordinates(cut).reshape(-1, 4, 2)[:, :3]
+    one, two = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
+    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
+    xy[under] = xy[under][:, ::-1]
+    slope = normal[of, None, :2] / normal[of, None, 2:]
+    z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
+    vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)
+    up = np.tile([0.0, 0.0, 1.0], (len(vertices), 1))
+    return Mesh(vertices, up, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+
+
+def _field(street_map: StreetMap, line: Polyline, width_m: float) -> shapely.Geometry:
+    """Where domes lie before a line's end, beyond it as seen from the crossing."""
+    x, y, heading = line.at(line.length_m)
+    along = np.array([math.cos(heading), math.sin(heading)])
+    left = 0.5 * (width_m - 0.3) * np.array([-along[1], along[0]])
+    near = np.array([x, y]) + _TACTILE_BEHIND_M * along
+    far = near + TACTILE_M * along
+    field = shapely.Polygon([near - left, far - left, far + left, near + left])
+    walked = [corner.polygon for corner in street_map.near("corner", field)]
+    walked += [s.polygon for s in street_map.near("strip", field) if isinstance(s, Strip) and s.kind == "sidewalk"]
+    return shapely.intersection(field, shapely.union_all(walked)) if walked else shapely.Polygon()

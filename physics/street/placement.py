@@ -1,0 +1,292 @@
+"""Where street furniture stands: drawn for each sidewalk from the street map and a seed, zone by zone.
+
+A sidewalk's props are drawn from its own generator, and a prop belongs to the tile of its middle: what stands in a
+tile does not depend on which tiles were asked for before. Along the middle of every sidewalk a band is kept free.
+No car is parked on the road: the crowd engine drives on every lane. Cars stand at the ends of driveways.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Iterable, Sequence
+from typing import Final, NamedTuple
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Polyline
+from cosim.place import overlay
+from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
+from physics.street.buildings import Frontage
+from physics.street.furniture import CATALOGUE, KINDS, VARIANTS, Kind, Prop, Zone, footprints
+from physics.street.mapped import MappedThings
+from physics.world.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
+
+CLEAR_HALF_M: Final = 0.6
+"""The least half width of the band that is kept free along the middle of a sidewalk."""
+
+END_M: Final = 2.0
+"""Nothing stands nearer to the end of a sidewalk or to a crossing."""
+
+GAP_M: Final = 0.25
+"""Least distance between two props."""
+
+_EDGE_M: Final = 0.6
+"""The outer edge of a wide sidewalk that props at the curb may use."""
+
+GOLDEN_RAD: Final = 2.399963
+"""Each tree is turned by so much more than the one before: no two look alike."""
+
+_MARGIN_M: Final = 0.06
+_VERGE_MIN_M: Final = 0.3
+_ZONE_MAX_M: Final = 6.0
+_REACH_M: Final = 12.0
+"""Props stand nearer than this to their sidewalk, and the middle of a house to its walls."""
+
+_STREET: Final[tuple[PieceKind, ...]] = ("strip", "corner", "lane", "junction")
+_BY_TYPE: Final = (
+    (("motorway", "trunk", "primary", "secondary"), "avenue"),
+    (("tertiary",), "commercial"),
+    (("living", "service", "alley"), "narrow"),
+)
+"""Street classes of imported maps, by words in the type of the edge; the rest are residential."""
+
+
+class _Band(NamedTuple):
+    """Where the props of a zone may be: distances from the middle line, positive away from the road, in metres."""
+
+    low_m: float
+    high_m: float
+
+
+class Placement:
+    """The props of a map under a seed; pure functions of map, seed and what is asked for, kept once known."""
+
+    def __init__(
+        self, street_map: StreetMap, seed: int, frontage: Frontage, mapped: MappedThings | None = None
+    ) -> None:
+        self._map = street_map
+        self._seed = seed
+        self._frontage = frontage
+        self._mapped = MappedThings(street_map) if mapped is None else mapped
+        self._drawn: dict[str, tuple[list[Prop], NDArray[np.object_]]] = {}
+        self._kept: dict[str, tuple[Prop, ...]] = {}
+        self._houses: dict[Key, list[shapely.Geometry]] = {}
+
+    def in_tile(self, key: Key) -> tuple[Prop, ...]:
+        """Props whose middle lies in the tile, in the net's order."""
+        strips = self._map.near("strip", shapely.box(*_grown(square(key), _REACH_M)))
+        props = [prop for s in strips if isinstance(s, Strip) for prop in self.on_strip(s)]
+        return (*self._mapped.props(key), *(prop for prop in props if key_at(prop.x_m, prop.y_m) == key))
+
+    def on_strip(self, strip: Strip) -> tuple[Prop, ...]:
+        """Props of a sidewalk: as drawn, without those that meet a house or what another sidewalk has drawn."""
+        if strip.id not in self._kept:
+            props, ground = self._draw(strip)
+            hit = np.zeros(len(props), dtype=bool)
+            if props:
+                area = shapely.box(*_grown(shapely.total_bounds(ground), _REACH_M))
+                others = [s for s in self._map.near("strip", area) if isinstance(s, Strip) and s.id < strip.id]
+                rivals = [polygon for s in others for polygon in self._draw(s)[1]]
+                rivals += list(footprints(self._mapped_in(area)))
+                hit |= _meets(ground, rivals, GAP_M)
+                spread = np.array([KINDS[prop.kind].spread_m for prop in props])
+                hit |= _meets(shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M)
+            self._kept[strip.id] = tuple(prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit)
+        return self._kept[strip.id]
+
+    def _mapped_in(self, area: shapely.Polygon) -> list[Prop]:
+        return [prop for key in _keys_of(area) for prop in self._mapped.props(key)]
+
+    def _houses_in(self, area: shapely.Polygon) -> list[shapely.Geometry]:
+        keys = _keys_of(area)
+        for key in keys:
+            if key not in self._houses:
+                self._houses[key] = [b.polygon for b in self._frontage.in_tile(key)]
+        return [house for key in keys for house in self._houses[key]]
+
+    def _draw(self, strip: Strip) -> tuple[list[Prop], NDArray[np.object_]]:
+        """Props of a sidewalk that fit its zones, the street and each other, and their footprints."""
+        if strip.id not in self._drawn:
+            props = list(draw(strip, self._seed)) if strip.kind == "sidewalk" else []
+            shown = self._mapped.kinds
+            props = [
+                p for p in props if p.kind not in shown or not self._mapped.shows(p.kind, shapely.Point(p.x_m, p.y_m))
+            ]
+            ground = footprints(props)
+            if props:
+                free = _fits(self._map, strip, props, ground)
+                props = [prop for prop, is_free in zip(props, free, strict=True) if is_free]
+                ground = ground[free]
+            self._drawn[strip.id] = props, ground
+        return self._drawn[strip.id]
+
+
+def draw(strip: Strip, seed: int) -> Iterable[Prop]:
+    """Props for a sidewalk, drawn kind by kind; they may still meet each other or another street."""
+    line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
+    bands = zones(strip)
+    usable = line.length_m - 2.0 * END_M
+    if usable < 1.0 or not bands:
+        return
+    rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0x9209])
+    style = street_style(strip.street_class)
+    driveways = [s if strip.road_side <= 0 else line.length_m - s for s in strip.driveways]
+    busy = float(rng.uniform(0.5, 1.5))
+    n = 0
+    for kind in CATALOGUE:
+        fitting = [zone for zone in kind.zones if zone in bands]
+        expected = kind.per_100m[style] * busy * usable / 100.0
+        count = int(expected + rng.random())
+        variant, paint = int(rng.integers(VARIANTS)), int(rng.integers(len(kind.paints)))
+        aside, phase = rng.random(2)
+        if not fitting:
+            continue
+        if "driveway" in fitting:
+            count = min(count, len(driveways))
+        for k in range(count):
+            u, v, w = rng.random(3)
+            if kind.row:
+                # What stands in a row is alike: one size, one distance from the curb.
+                s, share, zone = (k + 0.2 + 0.6 * phase + 0.05 * u) / count * usable, aside, fitting[0]
+            else:
+                s, share, zone = u * usable, v, fitting[min(int(w * len(fitting)), len(fitting) - 1)]
+                variant, paint = int(rng.integers(VARIANTS)), int(rng.integers(len(kind.paints)))
+            size = kind.size_m(variant)
+            at_m = driveways[k] if zone == "driveway" else END_M + s
+            turned = zone == "driveway" and _room(bands[zone]) > size[0]
+            prop = _stood(strip, line, at_m, bands[zone], share, kind, variant, paint, zone, turned, n)
+            if prop is None or (zone != "driveway" and any(_blocks(at_m, size[0], d) for d in driveways)):
+                continue
+            yield prop
+            n += 1
+
+
+def _stood(
+    strip: Strip, line: Polyline, at_m: float, band: _Band, share: float, kind: Kind, variant: int, paint: int,
+    zone: Zone, turned: bool, n: int,
+) -> Prop | None:  # fmt: skip
+    """A prop at an arc length of the line and a share of the free depth of its zone; None when it is too deep."""
+    length, depth, _ = kind.size_m(variant)
+    if turned:
+        length, depth = depth, length
+    slack = _room(band) - depth
+    if slack < 0.0 or not END_M + 0.5 * length <= at_m <= line.length_m - END_M - 0.5 * length:
+        return None
+    x, y, along = line.at(at_m)
+    away = band.low_m + 0.5 * depth + share * slack
+    heading = along + (0.5 * math.pi if turned else 0.0 if zone in ("frontage", "driveway") else math.pi)
+    x, y = x - away * math.sin(along), y + away * math.cos(along)
+    further = 0.0
+    if kind.name == "lamp" and zone == "frontage":
+        further = math.pi  # its arm reaches over the sidewalk and the road, not into the houses
+    elif kind.grown:
+        further = GOLDEN_RAD * n
+    return Prop(f"prop:{strip.id}:{n}", kind.name, variant, x, y, heading, paint, further)
+
+
+def zones(strip: Strip) -> dict[Zone, _Band]:
+    """The zones beside a sidewalk that props may use."""
+    half = 0.5 * strip.width_m
+    found: dict[Zone, _Band] = {}
+    if strip.road_side != 0:
+        verge = min(strip.verge_m, _ZONE_MAX_M)
+        if verge >= _VERGE_MIN_M:
+            found["verge"] = _Band(-half - verge + CURBSTONE_M, -half - 0.02)
+        elif half - clear_half_m(strip) > 0.1:
+            found["curb"] = _Band(-half + _MARGIN_M, -clear_half_m(strip) - 0.01)
+    frontage = min(strip.frontage_m, _ZONE_MAX_M)
+    if frontage > 2.0 * _MARGIN_M:
+        found["frontage"] = found["driveway"] = _Band(half + _MARGIN_M, half + frontage - 2.0 * _MARGIN_M)
+    return found
+
+
+def clear_half_m(strip: Strip) -> float:
+    """Half the width of the band along the middle of a sidewalk where nothing stands."""
+    return min(max(CLEAR_HALF_M, 0.5 * strip.width_m - _EDGE_M), 0.5 * strip.width_m)
+
+
+def street_style(street_class: str) -> str:
+    """The column of the catalogue for a street class of ours or a type of an imported edge."""
+    if street_class in CATALOGUE[0].per_100m:
+        return street_class
+    return next((ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential")
+
+
+def standing(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
+    """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
+    mapped = MappedThings(street_map)
+    placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
+    made_up = (prop for strip in street_map.strips.values() for prop in placement.on_strip(strip))
+    return (*mapped.all_props, *made_up)
+
+
+def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
+    """For each driveway of a sidewalk what must stay open: its way from the road through verge, sidewalk and frontage,
+    and the flares of its ramp."""
+    line = Polyline(strip.line)
+    found: list[shapely.Geometry] = []
+    for at_m in strip.driveways:
+        x, y, heading = line.at(at_m)
+        along = 0.5 * DRIVEWAY_M * np.array([math.cos(heading), math.sin(heading)])
+        aside = strip.road_side * np.array([-math.sin(heading), math.cos(heading)])
+        road = np.array([x, y]) + (0.5 * strip.width_m + strip.verge_m) * aside
+        far = np.array([x, y]) - (0.5 * strip.width_m + strip.frontage_m) * aside
+        way = shapely.Polygon([road - along, road + along, far + along, far - along])
+        flares = shapely.buffer(shapely.LineString([road - along, road + along]), RAMP_M)
+        found.append(overlay.union(way, flares))
+    return found
+
+
+def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]) -> NDArray[np.bool_]:
+    """Which props keep off the clear band, off other streets' ground and off each other, the earlier first."""
+    area = shapely.box(*_grown(shapely.total_bounds(ground), END_M))
+    taken: list[shapely.Geometry] = []
+    for piece in [piece for kind in _STREET for piece in street_map.near(kind, area)]:
+        if piece is strip or (isinstance(piece, Lane) and piece.kind == "verge"):
+            continue
+        is_crossing = isinstance(piece, Strip) and piece.kind == "crossing"
+        taken.append(shapely.buffer(piece.polygon, END_M) if is_crossing else piece.polygon)
+    free = ~_meets(ground, taken, 0.02)
+    ways = [way for s in street_map.near("strip", area) if isinstance(s, Strip) for way in driveway_ground(s)]
+    free &= ~_meets(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
+    half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
+    free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
+    one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=GAP_M)
+    earlier: dict[int, list[int]] = {}
+    for i, j in zip(one.tolist(), two.tolist(), strict=True):
+        if j < i:
+            earlier.setdefault(i, []).append(j)
+    for i in sorted(earlier):
+        free[i] &= not any(free[j] for j in earlier[i])
+    return np.asarray(free, dtype=bool)
+
+
+def _meets(ground: NDArray[np.object_], taken: Sequence[shapely.Geometry], gap_m: float) -> NDArray[np.bool_]:
+    hit = np.zeros(len(ground), dtype=bool)
+    if taken:
+        hit[shapely.STRtree(taken).query(ground, predicate="dwithin", distance=gap_m)[0]] = True
+    return hit
+
+
+def _blocks(at_m: float, length_m: float, driveway_m: float) -> bool:
+    """Whether something stands on a driveway or on the ramp to it."""
+    return abs(at_m - driveway_m) < 0.5 * (DRIVEWAY_M + length_m) + RAMP_M
+
+
+def _keys_of(area: shapely.Geometry) -> list[Key]:
+    """The tiles that the bounds of an area touch."""
+    x0, y0, x1, y1 = shapely.bounds(area).tolist()
+    (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+    return [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+
+
+def _room(band: _Band) -> float:
+    return band.high_m - band.low_m
+
+
+def _grown(bounds: Iterable[float], by_m: float) -> tuple[float, float, float, float]:
+    x0, y0, x1, y1 = (float(b) for b in bounds)
+    return x0 - by_m, y0 - by_m, x1 + by_m, y1 + by_m

@@ -1,0 +1,93 @@
+"""What is drawn of fences and crosswalk signals."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import shapely
+
+from cosim.core.geometry import Polyline
+from cosim.place.street_map import StreetMap, Strip
+from cosim.spec.scenario import Barrier
+from physics.world.mesh import Mesh, box, join
+from physics.world.tiles import Key, key_at, square
+
+RED: Final = (0.82, 0.10, 0.09)
+WHITE: Final = (0.93, 0.93, 0.91)
+POLE: Final = (0.22, 0.24, 0.25)
+LAMPS: Final = {True: (0.10, 0.85, 0.35), False: (0.95, 0.12, 0.08)}
+"""Colour of the lit lamp: may one walk?"""
+
+_BOARD_M: Final = 0.35
+
+
+def barrier_meshes(barrier: Barrier) -> tuple[Mesh, Mesh]:
+    """Red and white parts of a fence about its foot, before it is turned: x along the way it closes."""
+    count = max(2 * round(barrier.length_m / _BOARD_M / 2.0) + 1, 3)
+    step = barrier.length_m / count
+    red: list[Mesh] = []
+    white: list[Mesh] = []
+    for low, high in ((0.45, 0.68), (0.77, 1.0)):
+        height = (high - low) * barrier.height_m
+        for k in range(count):
+            centre = (0.0, (k + 0.5) * step - 0.5 * barrier.length_m, 0.5 * (low + high) * barrier.height_m)
+            board = box((0.5 * barrier.thickness_m, step, height), centre, skip=("left", "right"))
+            (red if k % 2 == 0 else white).append(board)
+    for side in (-1, 1):
+        y = side * (0.5 * barrier.length_m - 0.15)
+        white.append(box((0.05, 0.05, 0.9 * barrier.height_m), (0.0, y, 0.45 * barrier.height_m)))
+        white.append(box((4.0 * barrier.thickness_m, 0.10, 0.06), (0.0, y, 0.03)))
+    return join(red), join(white)
+
+
+@dataclass(frozen=True, slots=True)
+class SignalPost:
+    """A pedestrian signal at one end of a crossing; its face looks over the crossing."""
+
+    crossing: str
+    x_m: float
+    y_m: float
+    heading_rad: float
+
+
+def posts_in(street_map: StreetMap, key: Key) -> list[SignalPost]:
+    """The pedestrian signals that stand in a tile."""
+    x0, y0, x1, y1 = square(key)
+    strips = street_map.near("strip", shapely.box(x0 - 5.0, y0 - 5.0, x1 + 5.0, y1 + 5.0))
+    crossings = [s for s in strips if isinstance(s, Strip) and s.signalised]
+    posts = [post for s in crossings for post in signal_posts(street_map, s)]
+    return [post for post in posts if key_at(post.x_m, post.y_m) == key]
+
+
+def signal_posts(street_map: StreetMap, crossing: Strip) -> tuple[SignalPost, SignalPost]:
+    """The posts at both ends of a signalised crossing: at the curb beside it, where nobody walks, on the right as
+    one comes towards it unless that is walkable."""
+    line = Polyline(crossing.line)
+    first, second = (_post(street_map, crossing, Polyline(points)) for points in (line.points, line.points[::-1]))
+    return first, second
+
+
+def _post(street_map: StreetMap, crossing: Strip, line: Polyline) -> SignalPost:
+    x, y, heading = line.at(line.length_m)
+    cos, sin = math.cos(heading), math.sin(heading)
+    aside, back = 0.5 * crossing.width_m + 0.3, 0.15
+    places = [(x - back * cos + side * aside * sin, y - back * sin - side * aside * cos) for side in (1, -1)]
+    free = [at for at in places if not _walkable(street_map, at)]
+    return SignalPost(crossing.id, *(free or places)[0], heading + math.pi)
+
+
+def _walkable(street_map: StreetMap, at: tuple[float, float]) -> bool:
+    spot = shapely.Point(at).buffer(0.1)
+    return bool(street_map.near("strip", spot) or street_map.near("corner", spot))
+
+
+def post_mesh() -> Mesh:
+    """Pole and housing, the face towards +x."""
+    return join([box((0.08, 0.08, 2.2), (0.0, 0.0, 1.1), skip=("bottom",)), box((0.14, 0.30, 0.62), (0.03, 0.0, 2.4))])
+
+
+def lamp_mesh(walk: bool) -> Mesh:
+    """The lit lamp on the face: red above, green below."""
+    return box((0.03, 0.24, 0.24), (0.11, 0.0, 2.27 if walk else 2.54), skip=("back",))

@@ -1,0 +1,83 @@
+"""Drawing scenarios from a seed until one fits its place, and what every scenario along a route has."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from typing import Final
+
+import msgspec
+import shapely
+
+from cosim.core.errors import CosimError, SpecError
+from cosim.core.geometry import Polyline
+from cosim.place.street_map import StreetMap
+from cosim.spec.scenario import Place, RouteCrossing, Scenario
+
+TRIES: Final = 400
+
+
+class Refusals:
+    """Why draws were refused, and how often."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+
+    def add(self, refusal: CosimError) -> None:
+        """Count one more. What follows a colon is of this draw alone."""
+        self._counts[str(refusal).split(":")[0]] += 1
+
+    def __str__(self) -> str:
+        return "; ".join(f"{reason} ({n} times)" for reason, n in self._counts.most_common())
+
+    @property
+    def most_frequent(self) -> str:
+        """The reason given most often, "" without any."""
+        return self._counts.most_common(1)[0][0] if self._counts else ""
+
+
+def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
+    """The first of TRIES draws that is not refused. Raises SpecError, `failure` and how often each reason was given."""
+    refusals = Refusals()
+    found = first_of((draw for _ in range(TRIES)), refusals)
+    if found is None:
+        raise SpecError(f"{failure} in {TRIES} draws: {refusals}")
+    return found
+
+
+def first_of(draws: Iterable[Callable[[], Scenario]], refusals: Refusals) -> Scenario | None:
+    """The first scenario that is not refused, None when all are; refusals are counted."""
+    for draw in draws:
+        try:
+            return draw()
+        except CosimError as refusal:
+            refusals.add(refusal)
+        except shapely.errors.GEOSException as error:
+            refusals.add(SpecError(f"the ground is too tangled: {error}"))
+    return None
+
+
+def along(
+    route: Polyline,
+    crossings: tuple[RouteCrossing, ...],
+    place: Place,
+    street_map: StreetMap,
+    *,
+    suite: str,
+    seed: int,
+    scenario_id: str,
+    time_limit_s: float,
+) -> Scenario:
+    """A scenario from one end of a route to the other, with nothing else in it yet: its builder adds that."""
+    start, goal = route.at(0.0), route.at(route.length_m)
+    return Scenario(
+        id=scenario_id,
+        suite=suite,
+        place=msgspec.structs.replace(place, net_hash=street_map.net_hash),
+        seed=seed,
+        start=(start.x_m, start.y_m, start.heading_rad),
+        goal=(goal.x_m, goal.y_m),
+        route=tuple((float(x), float(y)) for x, y in route.points),
+        crossings=crossings,
+        time_limit_s=time_limit_s,
+    )

@@ -1,0 +1,119 @@
+"""Suites drawn on the spot: routes on any known map, from a seed."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import shapely
+
+from cosim.core.errors import MapError, SpecError, unknown
+from cosim.core.geometry import Polyline
+from cosim.place.street_map import StreetMap, Strip
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import GROUPS, Kind
+from cosim.spec.scenario import CityMap, Place, Scenario, Suite
+from scenarios.builders import long_horizon, reactive
+from scenarios.execution.places import place
+from sumo_nets.maps.place_names import place_called
+
+KINDS = ("long-horizon", "reactive")
+PERSON_M2 = 25.0
+"""Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
+
+SAMPLE_M = 20.0
+
+
+def suite_on_map(
+    kind: str, called: str, seed: int, count: int | None, roughness: float = 0.0, events: Sequence[str] = ()
+) -> Suite:
+    """A suite drawn on a place, by whatever the user calls it; the same arguments and net give the same suite.
+
+    count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one of each by default.
+    events: which of them; those for which the place has no room are left out, and the description says so, unless they
+    were asked for. Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
+    roughness: of the ground, from 0 (flat) to 1.
+
+    Raises UsageError for another kind of suite, and whatever the place or the builder has to refuse.
+    """
+    if kind not in KINDS:
+        raise unknown("suite for --map", kind, KINDS)
+    for event in events:
+        if event not in GROUPS:
+            raise unknown("event", event, GROUPS)
+    where = place_called(called, roughness)
+    _, street_map = place(where)
+    name = where.map if isinstance(where, CityMap) else where.name
+    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed)
+    scenarios, left_out = drawn.long(count or 1) if kind == "long-horizon" else drawn.reactive(count, events)
+    return Suite(
+        name=kind,
+        version=f"map-{name}-{seed}" + (f"-rough{roughness:g}" if roughness else ""),
+        scenarios=tuple(thinned(scenario, street_map) for scenario in scenarios),
+        description=f"Drawn on {name}. {' '.join(left_out)}".strip(),
+    )
+
+
+class _Drawn(NamedTuple):
+    """What scenarios are drawn on. seed: of the first one."""
+
+    where: Place
+    street_map: StreetMap
+    graph: WalkGraph
+    name: str
+    seed: int
+
+    def long(self, count: int) -> tuple[list[Scenario], list[str]]:
+        """So many long-horizon scenarios; nothing is left out."""
+        seeds = range(self.seed, self.seed + count)
+        ids = [f"{self.name}-{seed:03d}" for seed in seeds]
+        build = long_horizon.build
+        return [build(self.where, self.street_map, self.graph, n, i) for n, i in zip(seeds, ids, strict=True)], []
+
+    def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
+        """So many reactive scenarios, their events in turn, and a sentence for each event there is no room for."""
+        kinds = [kind for kind in GROUPS if kind in asked or not asked]
+        found: list[Scenario] = []
+        left_out: list[str] = []
+        for seed in itertools.count(self.seed):
+            for kind in list(kinds):
+                try:
+                    found.append(self._one(kind, seed))
+                except (SpecError, MapError) as refusal:
+                    if asked:
+                        raise
+                    kinds.remove(kind)
+                    left_out.append(f"No '{kind}': {refusal}.")
+                if count is not None and len(found) == count:
+                    return found, left_out
+            if count is None or not kinds:
+                break
+        if not found:
+            raise SpecError(f"no reactive scenario fits on '{self.name}': {' '.join(left_out)}")
+        return found, left_out
+
+    def _one(self, kind: Kind, seed: int) -> Scenario:
+        scenario_id = f"{kind}-{self.name}-{seed:03d}"
+        return reactive.build(kind, self.where, self.street_map, self.graph, seed, scenario_id)
+
+
+def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
+    """The scenario with no more people than the sidewalks within the crowd's radius of its route have room for."""
+    route = Polyline(np.array(scenario.route))
+    around = [
+        shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
+        for s_m in np.arange(0.0, route.length_m, SAMPLE_M)
+    ]
+    area_m2 = [
+        sum(
+            strip.polygon.intersection(disc).area
+            for strip in street_map.near("strip", disc)
+            if isinstance(strip, Strip) and strip.kind == "sidewalk"
+        )
+        for disc in around
+    ]
+    persons = min(scenario.crowd.persons, round(float(np.mean(area_m2)) / PERSON_M2))
+    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons))

@@ -1,0 +1,79 @@
+"""`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that keeps its velocity.
+
+Direction and speed are fixed at the trigger, and anew where it had to step round somebody. It walks to the other edge
+of the sidewalk and on along it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+import msgspec
+
+from cosim.core.state import Doing
+from cosim.spec.events import Event, EventQuery, EventState, Walker
+from scenarios.events.behavior import Behavior, ahead
+from scenarios.events.sight import sight_of
+from scenarios.events.walking import edge_m, gave_up, placed, pressed_on, walked_on
+
+TRIGGER_M: Final = 4.0
+SLOWEST_MPS: Final = 0.2
+FASTEST_MPS: Final = 2.0
+"""A robot that stands is crossed before at the slowest pace; nobody runs faster than this."""
+
+
+def _begin(event: Event) -> tuple[Walker, ...]:
+    return (placed(event, 0.0, event.side * edge_m(event), -event.side * math.pi / 2),)
+
+
+def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
+    (walker,) = state.walkers
+    sight = sight_of(event, 0, query)
+    if walker.aim_rad is None or walker.pace_mps is None:
+        aim_rad, pace_mps = _course(event, walker, query)
+        walker = msgspec.structs.replace(walker, aim_rad=aim_rad, pace_mps=pace_mps)
+        assert walker.aim_rad is not None and walker.pace_mps is not None
+    dx, dy = walker.x_m - event.x_m, walker.y_m - event.y_m
+    left_m = -dx * math.sin(event.heading_rad) + dy * math.cos(event.heading_rad)
+    across = -event.side * left_m >= edge_m(event)
+    if state.phase == "acting" and (across or gave_up(walker, query)):
+        state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
+    if state.phase == "over":
+        away_rad = event.heading_rad + math.pi
+        return msgspec.structs.replace(state, walkers=(walked_on(walker, away_rad, event.speed_mps, sight),))
+    return msgspec.structs.replace(state, walkers=(pressed_on(walker, walker.aim_rad, walker.pace_mps, sight),))
+
+
+def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:
+    """The collision course; straight on at its pace for who was led aside, once the robot can be met no more."""
+    aim_rad, pace_mps = collision_course(walker, query, event.side)
+    if walker.pace_mps is None:
+        return aim_rad, pace_mps
+    across_rad = event.heading_rad - event.side * math.pi / 2
+    dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
+    passed = math.cos(query.robot_heading_rad) * dx + math.sin(query.robot_heading_rad) * dy <= 0.0
+    if passed or math.cos(aim_rad - across_rad) <= 0.0:
+        return across_rad, walker.pace_mps
+    return aim_rad, pace_mps
+
+
+def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:
+    """(heading, speed) at right angles to the robot's heading, to meet the robot's centre if that keeps its velocity.
+
+    side: where the walker stands, left (1) or right (-1) of the robot's path.
+    """
+    cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
+    dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
+    ahead_m, left_m = cos * dx + sin * dy, -sin * dx + cos * dy
+    towards = -math.copysign(1.0, left_m if abs(left_m) > 1e-6 else side)
+    in_s = max(ahead_m, 0.0) / max(query.robot_v_mps, 1e-6)
+    pace_mps = abs(left_m) / max(in_s, 1e-6)
+    return query.robot_heading_rad + towards * math.pi / 2, min(max(pace_mps, SLOWEST_MPS), FASTEST_MPS)
+
+
+def _doing(event: Event, state: EventState, number: int) -> Doing:
+    return "stand"
+
+
+LATERAL: Final = Behavior(ahead(TRIGGER_M), _begin, _act, _doing)

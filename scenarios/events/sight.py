@@ -1,0 +1,148 @@
+"""Sight: what one person of an event knows of a tick: the query, and the people round it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import msgspec
+
+from cosim.core.state import PERSON_RADIUS_M
+from cosim.people.orca import HalfPlane
+from cosim.people.steering import HORIZON_S, LEAST_M, ROOM_M, Neighbour, Vector, steered
+from cosim.spec.events import Bystander, Event, EventQuery, Walker
+
+COMES_UP_M = 1.5
+"""From here on, who insists on a place walks up to whoever is there, not round."""
+
+BESIDE_M = 1.0
+"""So near to a place that is taken one comes; one who does not insist on it stands there."""
+
+STILL_MPS = 0.1
+"""Slower ones stand."""
+
+SQUEEZES_S = 3.0
+PRESSES_S = 6.0
+"""Who insists on a place and is not there after the first time squeezes through; after the second the crowd gives
+way."""
+
+SAME_M = 0.001
+"""Who is nearer is in the same place."""
+
+SHARED = 0.5
+"""Of the avoidance between two who steer the same way."""
+
+
+class Sight(NamedTuple):
+    """What somebody knows: the query, the people round it but not itself, the event on whose ground it stays.
+
+    room_m: what it keeps from others where it can.
+    """
+
+    query: EventQuery
+    others: Sequence[Neighbour] = ()
+    event: Event | None = None
+    room_m: float = ROOM_M
+
+
+def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
+    """The sight of person `number` of an event: it sees its fellows, people of other events, and bystanders.
+
+    waited_s: how long it has been on its way to a place on which it insists.
+    """
+    others = [
+        fellow(walker)
+        for one, state in zip(query.events, query.states, strict=False)
+        if state.phase != "gone"
+        for k, walker in enumerate(state.walkers)
+        if (one.id, k) != (event.id, number)
+    ]
+    if waited_s < PRESSES_S:
+        others += met(query.bystanders)
+    return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else LEAST_M)
+
+
+def sight_of_guest(name: str, guest: Walker, query: EventQuery) -> Sight:
+    """The sight of the guest that is shown under this id."""
+    walkers = [walker for state in query.states if state.phase != "gone" for walker in state.walkers]
+    others = (_told_apart(name, guest, one) for one in query.bystanders if one.id != name)
+    return Sight(query, [*map(fellow, walkers), *met(others)])
+
+
+def _told_apart(name: str, guest: Walker, other: Bystander) -> Bystander:
+    """Who is in the very same place, as two are who are injected there at once, is seen a little to one side: else they
+    would walk in each other for ever."""
+    if math.hypot(other.x_m - guest.x_m, other.y_m - guest.y_m) > SAME_M:
+        return other
+    left_m = SAME_M if name < other.id else -SAME_M
+    cos, sin = math.cos(guest.heading_rad), math.sin(guest.heading_rad)
+    return msgspec.structs.replace(other, x_m=guest.x_m - left_m * sin, y_m=guest.y_m + left_m * cos)
+
+
+def fellow(walker: Walker) -> Neighbour:
+    """Somebody who steers the same way, but for who stands: that one stays."""
+    moves = walker.vx_mps != 0.0 or walker.vy_mps != 0.0
+    return Neighbour(walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, SHARED if moves else 1.0)
+
+
+def met(bystanders: Iterable[Bystander]) -> list[Neighbour]:
+    """The crowd pays no heed; guests and residents who walk steer the same way."""
+    return [
+        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps, SHARED if b.id[0] in "en" and (b.vx_mps or b.vy_mps) else 1.0)
+        for b in bystanders
+    ]
+
+
+def taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
+    """Whether somebody stands where the walker wants to stop, and the walker has come up to them."""
+    return math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M and any(
+        math.dist(other[:2], goal) < LEAST_M and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
+        for other in sight.others
+    )
+
+
+def led_round(
+    walker: Walker, wanted: Vector, sight: Sight, goal: Vector | None = None, *, insisting: bool = False
+) -> Vector:
+    """Where a step ends that should end at `wanted` (m), once it is led round people; `wanted` itself where it is not.
+
+    goal: where the walker is going to stop. insisting: even if somebody is there, who will make room.
+    """
+    tick_s = sight.query.tick_ms / 1000
+    at = (walker.x_m, walker.y_m)
+    velocity = ((wanted[0] - at[0]) / tick_s, (wanted[1] - at[1]) / tick_s)
+    others, horizon_s = sight.others, HORIZON_S
+    if goal is not None:
+        far_m = math.dist(at, goal)
+        horizon_s = min(HORIZON_S, max(far_m / max(math.hypot(*velocity), 1e-9), tick_s))
+        if insisting and far_m < COMES_UP_M:
+            others = [other for other in others if math.dist(other[:2], goal) > LEAST_M]
+    if not others:
+        return wanted
+    vx, vy = steered(
+        at,
+        (walker.vx_mps, walker.vy_mps),
+        velocity,
+        others,
+        horizon_s=horizon_s,
+        room_m=sight.room_m,
+        walls=edges(walker, wanted, sight.event, tick_s),
+    )
+    return wanted if (vx, vy) == velocity else (at[0] + vx * tick_s, at[1] + vy * tick_s)
+
+
+def edges(walker: Walker, wanted: Vector, event: Event | None, tick_s: float) -> tuple[HalfPlane, ...]:
+    """The velocities that keep somebody on the sidewalk or crosswalk of its event; none for who leaves it anyway."""
+    if event is None:
+        return ()
+    ahead_x, ahead_y = math.cos(event.heading_rad), math.sin(event.heading_rad)
+    left_m = ahead_x * (walker.y_m - event.y_m) - ahead_y * (walker.x_m - event.x_m)
+    wanted_left_m = ahead_x * (wanted[1] - event.y_m) - ahead_y * (wanted[0] - event.x_m)
+    room_m = event.half_width_m - PERSON_RADIUS_M
+    if max(abs(left_m), abs(wanted_left_m)) > room_m + 1e-6:
+        return ()
+    return (
+        HalfPlane(ahead_y, -ahead_x, (left_m - room_m) / tick_s),
+        HalfPlane(-ahead_y, ahead_x, (-left_m - room_m) / tick_s),
+    )

@@ -1,0 +1,131 @@
+"""Where the event pedestrians of an episode are decided: in a session beside it, or in a process of their own.
+
+By default an episode brings its director along: a Zenoh session of its own in the same process, over a Unix socket in a
+temporary folder, with no port and nobody else in it. `cosim direct` serves any number of runs and episodes from outside
+(`cosim run --director ENDPOINT`). Both are asked over Zenoh at every tick, and both give the same bits.
+"""
+
+from __future__ import annotations
+
+import ast
+import fcntl
+import hashlib
+import importlib.util
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import scenarios.events
+from bridge import keys
+from bridge.director import Outside, RemoteDirector, Waiting, serve_director
+from bridge.session import Session
+from cosim.core.errors import DirectorLost, EngineError
+from cosim.episode.ports import Director
+from scenarios.events import react
+
+Direct = Callable[[str], AbstractContextManager[Director]]
+"""Gives the director of an episode, by the episode's name."""
+
+RETRY_S: Final = 0.2
+LEFT_S: Final = 60.0
+"""A folder that is younger may be one that an episode is only beginning to use."""
+_FOLDER: Final = "cosim-zenoh-"
+_SOCKET: Final = "hub.sock"
+_OURS: Final = ("cosim.", "scenarios.")
+
+
+@contextmanager
+def directed(episode: str) -> Iterator[Director]:
+    """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
+    with ExitStack() as stack:
+        _sweep(Path(tempfile.gettempdir()))
+        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=_FOLDER))
+        endpoint = f"unixsock-stream/{folder}/{_SOCKET}"
+        key = keys.director("local", keys.chunk(episode))
+        serve_director(stack.enter_context(Session.hub(endpoint)), key, react)
+        yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
+
+
+@contextmanager
+def directed_by(outside: Outside, waiting: Waiting, episode: str) -> Iterator[Director]:
+    """The simulator's end of a director outside, for one episode. Raises DirectorLost when it never comes."""
+    with _reached(outside, waiting) as session:
+        key = keys.director(outside.run, keys.chunk(episode))
+        yield RemoteDirector(session, key, by=behaviours(), wait_s=outside.wait_s, waiting=waiting)
+
+
+def serve(session: Session) -> None:
+    """Direct every run and episode that asks on this session."""
+    serve_director(session, keys.EVERY_DIRECTOR, react, behaviours())
+
+
+@cache
+def behaviours() -> str:
+    """What the behaviours are: a hash of their source and of all of ours that it imports. 16 hexadecimal digits."""
+    digest = hashlib.sha256()
+    for name, source in sorted(sources(scenarios.events.__name__).items()):
+        digest.update(name.encode() + b"\0" + source + b"\0")
+    return digest.hexdigest()[:16]
+
+
+def sources(name: str) -> dict[str, bytes]:
+    """The source of a module and of all of ours that it imports, however indirectly, by their names."""
+    found: dict[str, bytes] = {}
+    _gather(name, found)
+    return found
+
+
+def _gather(name: str, found: dict[str, bytes]) -> None:
+    """Put the source of a module, and of what it imports of ours, into `found`."""
+    if name in found:
+        return
+    try:
+        spec = importlib.util.find_spec(name)
+    except ModuleNotFoundError:  # what is imported from a module that is no package
+        return
+    if spec is None or spec.origin is None:
+        return
+    found[name] = Path(spec.origin).read_bytes()
+    for node in ast.walk(ast.parse(found[name])):
+        imported: list[str] = []
+        if isinstance(node, ast.Import):
+            imported = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
+        for other in imported:
+            if other.startswith(_OURS):
+                _gather(other, found)
+
+
+def _sweep(temporary: Path) -> None:
+    """Remove the folders of episodes that were killed: nobody holds the lock that Zenoh lays beside a socket."""
+    for lock in temporary.glob(f"{_FOLDER}*/{_SOCKET}.lock"):
+        with suppress(OSError):  # another user's, held, or gone meanwhile
+            if time.time() - lock.parent.stat().st_mtime > LEFT_S:
+                with lock.open("r+b") as file:
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    shutil.rmtree(lock.parent)
+
+
+def _reached(outside: Outside, waiting: Waiting) -> Session:
+    """A session with the director's hub, as soon as there is one."""
+    deadline = time.monotonic() + outside.wait_s
+    told = False
+    while True:
+        try:
+            return Session.client(outside.endpoint)
+        except EngineError as error:
+            if time.monotonic() > deadline:
+                raise DirectorLost(
+                    f"no director at {outside.endpoint} within {outside.wait_s:g} s: start one with `cosim direct "
+                    f"--listen {outside.endpoint}` ({error})"
+                ) from error
+        if not told:
+            waiting(f"waits for a director at {outside.endpoint}, {outside.wait_s:g} s at most")
+            told = True
+        time.sleep(RETRY_S)

@@ -1,0 +1,109 @@
+"""A recorded episode run again: the same commands, the same injections, the same state hash."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError, unknown
+from cosim.core.telling import Tell, untold
+from cosim.core.versions import versions
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.policies.replay import Replay
+from cosim.records.record import Log, Record, begun, row_of
+from cosim.records.run_folder import read_records
+from cosim.spec.scenario import Scenario, read_suite
+from scenarios.execution.assemble import staged
+from scenarios.execution.counterfactual import Beside, Compared
+from scenarios.execution.run import Watch, drive
+from sumo_nets.crowd.demand_log import Entrances
+
+OF_THE_ROAD: Final = 12
+"""From this value of a row on it is about the roads, which are judged beside the loop."""
+
+
+class Recorded(NamedTuple):
+    """All that a run folder holds of an episode."""
+
+    scenario: Scenario
+    record: Record
+    log: Log
+
+
+def recorded(folder: Path, scenario_id: str) -> Recorded:
+    """A finished episode. Raises UsageError with the valid names, RunError when it crashed."""
+    records = {record.scenario for record in read_records(folder)}
+    if scenario_id not in records:
+        raise unknown(f"finished episode in {folder}", scenario_id, records)
+    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
+    episode = folder / "episodes" / scenario_id
+    record = Record.load(episode / "record.json")
+    if record.status == "crashed":
+        raise RunError(f"{folder}: '{scenario_id}' crashed: there is nothing to run again")
+    return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
+
+
+def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:
+    """Run it again; the state hash that comes out."""
+    return _again(told, tell, *watches)[0]
+
+
+def compared(told: Recorded, tell: Tell = untold) -> tuple[str, Compared]:
+    """Run it again, then its street without the robot; the state hash, and what the robot cost the others."""
+    beside = Beside()
+    state_hash, entrances = _again(told, tell, beside.watch)
+    return state_hash, beside.compared(told.scenario, entrances, partial(tell, "the street without the robot"))
+
+
+def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]:
+    driver = Replay(told.log.command)
+
+    def watch(step: Step, _: Verdict) -> None:
+        tell(f"replaying {told.scenario.id}", step.tick / len(told.log))
+
+    tell("starting SUMO and PyBullet")
+    with staged(told.scenario, driver, script=told.record.injections) as stage:
+        record, _ = drive(
+            begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, watch, *watches
+        )
+    return record.state_hash, stage.entrances
+
+
+class Alike:
+    """Watches a replay, and holds every tick against the recorded trajectory, to the bit: the robot's pose, speeds and
+    command, its way, its resets, and how near the nearest person is."""
+
+    def __init__(self, folder: Path, told: Recorded) -> None:
+        self._folder, self._told = folder, told
+
+    def watch(self, step: Step, verdict: Verdict) -> None:
+        """The next tick. Raises RunError when it is not the recorded one."""
+        now, then = np.array(row_of(step, verdict)), self._told.log.row(step.tick)
+        if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
+            raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
+
+
+def check(folder: Path, told: Recorded, state_hash: str) -> None:
+    """Raises RunError when a replay came out otherwise than recorded."""
+    if state_hash != told.record.state_hash:
+        raise otherwise(folder, told, f"{state_hash[:16]}, recorded {told.record.state_hash[:16]}")
+
+
+def otherwise(folder: Path, told: Recorded, what: str) -> RunError:
+    """The error for a replay that came out otherwise than recorded; what: the difference."""
+    record, here = told.record, versions()
+    changed = [
+        f"{name} {record.versions.get(name)}, here {here[name]}"
+        for name in here
+        if here[name] != record.versions.get(name)
+    ]
+    why = f"made with other versions: {'; '.join(changed)}" if changed else "of the same versions: of other code"
+    return RunError(
+        f"{folder}: '{record.scenario}' was not the same when it was replayed ({what}). The record is {why}, or it was "
+        "changed. Replay it with the code that made it, or run it again."
+    )

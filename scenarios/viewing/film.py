@@ -1,0 +1,213 @@
+"""A film of an episode: its record is replayed, tick by tick, and drawn from behind, from above or from the robot.
+
+The replay is the same episode: every tick is held against the recorded trajectory, and at the end of the episode the
+state hash against the record's. A film that ends earlier is simulated no further than its last picture: it has no
+state hash to show, but every tick of it is as recorded.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.errors import RunError
+from cosim.core.geometry import Floats
+from cosim.core.state import RobotState, Street
+from cosim.core.telling import Tell, untold
+from cosim.episode.ports import CameraSpec, Eyes
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.policies.replay import Replay
+from cosim.records.record import Record, begun
+from cosim.report import hud
+from cosim.report.legend import Image
+from cosim.report.minimap import Minimap
+from cosim.report.video import Video
+from cosim.spec.scenario import Scenario
+from physics.cameras.choice import CameraChoice
+from scenarios.execution.assemble import staged
+from scenarios.execution.places import place
+from scenarios.execution.replay import Alike, check, recorded
+from scenarios.execution.run import drive
+from scenarios.viewing.look import View, behind, over
+
+EASE_S: Final = 0.5
+"""The follower's heading lags the robot's by about this much."""
+SMALLEST_PX: Final = (320, 180)
+ROBOT_FOV_DEG: Final = 75.0
+"""Of the robot's camera, up and down, at 4:3; wider pictures show no more to the sides."""
+ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
+FOV_DEG: Final = 62.0
+"""Of the views from behind and from above, up and down."""
+ABOVE_REST: Final = (2.0, 0.0, 10.0)
+"""From above, when nothing happens: metres ahead and to the left of the robot that are looked at, height of the eye."""
+ABOVE_HIGH_M: Final = (6.5, 12.0)
+NEAR_M: Final = 8.0
+"""Event people this near are kept in the picture from above."""
+
+
+class Cut(NamedTuple):
+    """What of an episode is filmed. from_s, to_s: simulated time; size: width, height; speed: times real time;
+    camera: what draws it; view: from where."""
+
+    from_s: float = 0.0
+    to_s: float = math.inf
+    size: tuple[int, int] = (1280, 720)
+    speed: int = 1
+    camera: CameraChoice = "auto"
+    view: View = "follow"
+
+
+class _Enough(Exception):
+    """The last picture is drawn."""
+
+
+def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
+    """Write the film of a finished episode; the simulated second at which it ends, infinite for the episode's end.
+
+    Raises RunError when there is no such episode, or when the replay differs; then there is no file.
+    """
+    told = recorded(folder, scenario_id)
+    scenario, record, log = told
+    if not cut.from_s < cut.to_s:
+        raise RunError(f"nothing lies between --from {cut.from_s:g} s and --to {cut.to_s:g} s: give a later --to")
+    last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
+    if not 0.0 <= cut.from_s < Clock().time_s(last):
+        raise RunError(
+            f"'{scenario_id}' lasts {Clock().time_s(len(log)):.1f} s: nothing to film from {cut.from_s:g} s on"
+        )
+    if cut.size[0] < SMALLEST_PX[0] or cut.size[1] < SMALLEST_PX[1]:
+        least = "x".join(map(str, SMALLEST_PX))
+        raise RunError(f"a film of {cut.size[0]}x{cut.size[1]} pixels: below {least} nothing can be read")
+    tell("reading the street map, starting SUMO, PyBullet and the camera")
+    _, street_map = place(scenario.place)
+    fps = round(1.0 / Clock().tick_s)
+    driver = Replay(log.command)
+    with ExitStack() as stack:
+        video = stack.enter_context(Video(output, cut.size, fps))
+        stage = stack.enter_context(staged(scenario, driver, cut.camera, script=record.injections))
+        camera = stack.enter_context(stage.eyes(robot_eye(cut)))
+        minimap = Minimap(street_map, scenario, stage.parts.world.footprint_m)
+        reel = _Reel(scenario, record, minimap, camera, video, cut, last, tell)
+
+        def until_the_last(step: Step, _: Verdict) -> None:
+            if step.tick + 1 == last < len(log):
+                raise _Enough
+
+        watches = (Alike(folder, told).watch, reel.take, until_the_last)
+        with suppress(_Enough):
+            again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, *watches)
+            check(folder, told, again.state_hash)
+    return math.inf if last == len(log) else Clock().time_s(last)
+
+
+def robot_eye(cut: Cut) -> CameraSpec:
+    """The robot's camera as large as it is in the film."""
+    layout = hud.Layout.of(*cut.size)
+    area = layout.view if cut.view == "robot" else layout.second
+    up = min(ROBOT_ASIDE * area.height / area.width, math.tan(math.radians(ROBOT_FOV_DEG / 2)))
+    return CameraSpec(area.width, area.height, math.degrees(2.0 * math.atan(up)))
+
+
+class _Reel:
+    """Draws step after step. The follower's eye moves smoothly from picture to picture."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        record: Record,
+        minimap: Minimap,
+        camera: Eyes,
+        video: Video,
+        cut: Cut,
+        last: int,
+        tell: Tell,
+    ) -> None:
+        self._scenario, self._record, self._minimap = scenario, record, minimap
+        self._camera, self._video, self._cut, self._last, self._tell = camera, video, cut, last, tell
+        self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
+        self._triggered: set[str] = set()
+        self._caption, self._caption_until = ("", hud.INK), -1
+        self._ahead: Floats = np.zeros(2)
+        self._over: Floats = np.array(ABOVE_REST)
+
+    def take(self, step: Step, verdict: Verdict) -> None:
+        """One tick of the episode; drawn if it lies within the cut."""
+        self._note(step, verdict)
+        robot = step.motion.robot
+        ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
+        share = Clock().tick_s / EASE_S
+        self._ahead = (1.0 - share) * self._ahead + share * ahead if self._ahead.any() else ahead
+        self._over = (1.0 - share) * self._over + share * _framed(robot, step.street_after)
+        first = Clock().ticks(self._cut.from_s)
+        if step.tick < first:
+            self._tell(f"simulating to {self._cut.from_s:g} s", step.tick / first)
+        if first <= step.tick < self._last and (step.tick - first) % self._cut.speed == 0:
+            self._video.add(self._picture(step, robot, step.street_after))
+            self._tell(f"filming {self._scenario.id}", (step.tick - first) / (self._last - first))
+
+    def _picture(self, step: Step, robot: RobotState, street: Street) -> Image:
+        width, height = self._cut.size
+        layout = hud.Layout.of(width, height)
+        image: Image = np.zeros((height, width, 3), dtype=np.uint8)
+        seen = self._camera.render(robot, street).rgb
+        if self._cut.view == "robot":
+            hud.fill(image, layout.view, seen)
+            hud.fill(image, layout.second, self._outside("follow", layout.second, robot, street), "from behind")
+        else:
+            hud.fill(image, layout.view, self._outside(self._cut.view, layout.view, robot, street))
+            hud.fill(image, layout.second, seen, "robot's camera")
+        area = layout.map
+        hud.fill(image, area, self._minimap.picture(robot, street, (area.width, area.height), self._ahead))
+        time_s = Clock().time_s(step.tick)
+        counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
+        done = step.route_s_after_m / self._scenario.route_line.length_m
+        left = f"{self._scenario.id}  {self._record.policy}  {time_s:5.1f} s  {robot.v_mps:.1f} m/s"
+        hud.bar(image, layout.bar, left, f"route {100.0 * done:.0f} %   {counts}", done)
+        if step.tick < self._caption_until:
+            hud.caption(image, layout.view, *self._caption)
+        return image
+
+    def _outside(self, view: View, area: hud.Area, robot: RobotState, street: Street) -> Image:
+        """What somebody sees who follows the robot, behind it or above it."""
+        if view == "follow":
+            eye, target = behind(robot, self._ahead)
+        else:
+            eye, target = over(robot, self._ahead, self._over)
+        return self._camera.picture(eye, target, street, robot, (area.width, area.height), FOV_DEG).rgb
+
+    def _note(self, step: Step, verdict: Verdict) -> None:
+        """Count failures, and choose what is captioned."""
+        for event, state in zip(self._scenario.events, step.events.states, strict=True):
+            if state.phase == "acting" and event.id not in self._triggered:
+                self._triggered.add(event.id)
+                self._say(step.tick, event.kind.replace("_", " "), hud.INK)
+        if verdict.failure is not None:
+            kind = verdict.failure.kind
+            self._counts[kind] += 1
+            other = f" with {verdict.failure.other_kind}" if verdict.failure.other_kind else ""
+            self._say(step.tick, kind.replace("_", " ") + other, hud.BAD)
+        if verdict.ended == "goal":
+            self._say(step.tick, "goal", hud.GOOD)
+
+    def _say(self, tick: int, text: str, colour: tuple[int, int, int]) -> None:
+        self._caption, self._caption_until = (text, colour), tick + Clock().ticks(hud.CAPTION_S)
+
+
+def _framed(robot: RobotState, street: Street) -> Floats:
+    """(3,) metres ahead and left of the robot, and height, from which it and the event people near it can be seen."""
+    cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
+    event = [name.startswith("e") for name in street.people.ids]
+    offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])
+    near = offset[np.hypot(*offset.T) < NEAR_M]
+    if not len(near):
+        return np.array(ABOVE_REST)
+    every = np.vstack([near, (0.0, 0.0)])
+    middle = 0.5 * (every.min(axis=0) + every.max(axis=0))
+    reach_m = float(np.hypot(*(every - middle).T).max())
+    return np.append(middle, np.clip(2.0 * reach_m + 3.0, *ABOVE_HIGH_M))

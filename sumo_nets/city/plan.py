@@ -1,0 +1,195 @@
+"""The plan of a city, ready to be built: nodes, edges, crossings and roundabouts, from a finished draft."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from sumo_nets.city.blocks import (
+    CLASSES,
+    Line,
+    Point,
+    Section,
+    bend,
+    corner,
+    direction,
+    length,
+    polar,
+    ring,
+    split,
+    straight,
+)
+from sumo_nets.city.draft import Cell, Draft, Link
+
+DRIVEWAY_CLEAR_M = 36.0
+"""Driveways keep this far from both ends of their street: junctions take up to 27 m of it."""
+DRIVEWAY_GAP_M = 12.0
+CROSSWALK_ROOM_M = 0.4
+"""The area of a crosswalk in the middle of a street goes so far beyond it on either side."""
+
+
+class Node(NamedTuple):
+    """A junction. signalised: with traffic lights. outline: of its area, where netconvert would make it too small."""
+
+    id: str
+    at: Point
+    signalised: bool
+    outline: tuple[Point, ...] = ()
+
+
+class Edge(NamedTuple):
+    """One direction of a street. driveways: points of its line beside which one crosses the sidewalk."""
+
+    id: str
+    tail: str
+    head: str
+    street_class: str
+    section: Section
+    line: Line
+    driveways: tuple[Point, ...] = ()
+
+
+class Zebra(NamedTuple):
+    """A crossing over the given edges at a node."""
+
+    node: str
+    edges: tuple[str, ...]
+    width_m: float
+
+
+class Ring(NamedTuple):
+    """A roundabout's nodes and edges."""
+
+    nodes: tuple[str, ...]
+    edges: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CityPlan:
+    """What is built: signal_rng draws the signal programs' times."""
+
+    nodes: tuple[Node, ...]
+    edges: tuple[Edge, ...]
+    zebras: tuple[Zebra, ...]
+    rings: tuple[Ring, ...]
+    signal_rng: np.random.Generator
+
+
+@dataclass(slots=True)
+class _Parts:
+    """What the plan has so far. joints: the node where a street, by number, meets a lattice point."""
+
+    nodes: dict[str, Node]
+    edges: list[Edge]
+    rings: list[Ring]
+    joints: dict[tuple[Cell, int], Node]
+    zebras: dict[str, list[Zebra]]
+
+
+def plan_of(draft: Draft, rngs: Mapping[str, np.random.Generator], crosswalks: float) -> CityPlan:
+    """The plan of a draft. crosswalks: share of the longer streets with a crosswalk in their middle."""
+    parts = _Parts({}, [], [], {}, defaultdict(list))
+    numbers = {id(link): number for number, link in enumerate(draft.links)}
+    for cell, arms in draft.arms().items():
+        draw = rngs["lights"].random()
+        ways = [(numbers[id(link)], link) for link in arms]
+        if cell in draft.rings:
+            _add_ring(parts, draft, cell, ways, rngs["widths"])
+        elif arms:
+            wide = any(CLASSES[link.street_class].lanes > 1 for link in arms)
+            lit = draw < (0.85 if wide else 0.25 if len(arms) > 3 else 0.08)
+            node = parts.nodes[_name(cell)] = Node(_name(cell), draft.at[cell], lit)
+            parts.joints |= {(cell, number): node for number, _ in ways}
+    for number, link in enumerate(draft.links):
+        _add_street(parts, draft, number, link, crosswalks, rngs)
+    zebras = tuple(zebra for node in parts.nodes for zebra in parts.zebras[node])
+    return CityPlan(tuple(parts.nodes.values()), tuple(parts.edges), zebras, tuple(parts.rings), rngs["signals"])
+
+
+def _name(cell: Cell) -> str:
+    return f"n{cell[0]}x{cell[1]}"
+
+
+def _add_ring(
+    parts: _Parts, draft: Draft, cell: Cell, ways: list[tuple[int, Link]], width_rng: np.random.Generator
+) -> None:
+    name, centre, radius = _name(cell), draft.at[cell], draft.rings[cell]
+    order = sorted((draft.leaving(link, cell) % (2.0 * math.pi), number) for number, link in ways)
+    angles = [angle for angle, _ in order]
+    around = [Node(f"{name}r{k}", polar(centre, radius, a), False) for k, a in enumerate(angles)]
+    section = CLASSES["ring"].section(width_rng)
+    arcs = [
+        Edge(f"{name}q{k}", around[k].id, around[(k + 1) % len(around)].id, "ring", section, line)
+        for k, line in enumerate(ring(centre, radius, angles))
+    ]
+    parts.nodes |= {node.id: node for node in around}
+    parts.joints |= {(cell, number): node for (_, number), node in zip(order, around, strict=True)}
+    parts.edges += arcs
+    parts.rings.append(Ring(tuple(n.id for n in around), tuple(e.id for e in arcs)))
+
+
+def _add_street(
+    parts: _Parts,
+    draft: Draft,
+    number: int,
+    link: Link,
+    crosswalks: float,
+    rngs: Mapping[str, np.random.Generator],
+) -> None:
+    """Both directions of a street, in two pieces where it has a crosswalk in its middle, and its crossings."""
+    tail, head = parts.joints[link.a, number], parts.joints[link.b, number]
+    line, name, made = _line(draft, link, tail.at, head.at), f"s{number}", CLASSES[link.street_class]
+    draws = rngs["crosswalks"].random(3).tolist()
+    width_m = made.crossings_m[int(rngs["widths"].integers(len(made.crossings_m)))]
+    blocked = sum(20.0 if end in draft.rings else 0.0 for end in (link.a, link.b))
+    if length(line) > (106.0 if link.via is None else 180.0) + blocked and draws[0] < crosswalks:
+        # Well before the corner of a street that has one.
+        where = 0.45 + 0.1 * draws[1] if link.via is None else 0.27
+        first, second = split(line, where * length(line))
+        outline = _across(first[-1], direction(first[-2], second[1]), link.section.half_m, width_m)
+        middle = Node(f"{name}m", first[-1], draws[2] < (0.7 if made.lanes > 1 else 0.25), outline)
+        parts.nodes[middle.id] = middle
+        parts.zebras[middle.id].append(Zebra(middle.id, (f"{name}a", f"-{name}a"), width_m))
+        pieces = [(f"{name}a", tail, middle, first), (f"{name}b", middle, head, second)]
+    else:
+        pieces = [(name, tail, head, line)]
+    for piece, start, end, shape in pieces:
+        there, back = (_driveways(way, made.driveways, rngs["driveways"]) for way in (shape, shape[::-1]))
+        parts.edges.append(Edge(piece, start.id, end.id, link.street_class, link.section, shape, there))
+        parts.edges.append(Edge(f"-{piece}", end.id, start.id, link.street_class, link.section, shape[::-1], back))
+        for node in (start, end):
+            if node in (tail, head):
+                parts.zebras[node.id].append(Zebra(node.id, (piece, f"-{piece}"), width_m))
+
+
+def _across(at: Point, heading: float, half_m: float, crossing_m: float) -> tuple[Point, ...]:
+    """The rectangle of a crosswalk and the sidewalks at its ends, with room for the curb ramps beside it."""
+    ahead, aside = 0.5 * crossing_m + CROSSWALK_ROOM_M, half_m
+    corners = ((ahead, aside), (ahead, -aside), (-ahead, -aside), (-ahead, aside))
+    cos, sin = math.cos(heading), math.sin(heading)
+    return tuple((at[0] + u * cos - v * sin, at[1] + u * sin + v * cos) for u, v in corners)
+
+
+def _driveways(line: Line, per_m: float, rng: np.random.Generator) -> tuple[Point, ...]:
+    """Where driveways meet a street: `per_m` of them per metre on average, far from its ends and from each other."""
+    found: list[Point] = []
+    at, end = DRIVEWAY_CLEAR_M, length(line) - DRIVEWAY_CLEAR_M
+    while per_m and (at := at + float(rng.exponential(1.0 / per_m))) < end:
+        found.append(split(line, at)[0][-1])
+        at += DRIVEWAY_GAP_M
+    return tuple(found)
+
+
+def _line(draft: Draft, link: Link, a: Point, b: Point) -> Line:
+    """The centre line between the points where the street starts and ends, a roundabout's rim included."""
+    leave, arrive = draft.leaving(link, link.a), draft.leaving(link, link.b) + math.pi
+    if link.via is not None:
+        return corner(a, draft.at[link.via], b, 32.0)
+    if link.turns == (0.0, 0.0):
+        return straight(a, b)
+    return bend(a, b, leave, arrive)

@@ -1,0 +1,12 @@
+"""The generated cities that ship with the benchmark, as seeds: made on demand, then kept in the cache."""
+
+from __future__ import annotations
+
+from cosim.spec.scenario import City
+
+SEEDS = tuple(range(1, 101))
+
+
+def shipped_cities(count: int = len(SEEDS), size_m: float = 2000.0, style: str = "mixed") -> tuple[City, ...]:
+    """The first `count` of the shipped cities."""
+    return tuple(City(seed=seed, size_m=size_m, style=style) for seed in SEEDS[:count])

@@ -1,0 +1,289 @@
+"""The rolling crowd: persons and vehicles kept around the robot, wherever in the city it goes.
+
+They enter out of its sight and are taken out once they are far from it, so a step costs the same in any city. Each
+kind draws from its own generator; ids are "c<n>" and "v<n>".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import msgspec
+import numpy as np
+
+from cosim.core.geometry import Floats, heading_to_sumo
+from cosim.people.gait import age_of
+from cosim.place.street_map import Port, StreetMap
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.scenario import CrowdSpec
+from sumo_nets.crowd.group_cohesion import Together
+from sumo_nets.crowd.group_sampling import STRIPE_M, Companies
+from sumo_nets.crowd.proxy import END_M, KEEP_ROUTE, MATCH_M
+from sumo_nets.crowd.room import Room
+from sumo_nets.crowd.spots import Spot, Spots
+
+SIGHT_M = 35.0
+"""Nobody appears nearer to the robot than this."""
+
+CLEAR_M = 8.0
+"""In the first fill, when nobody watches yet, nobody appears nearer than this."""
+
+ENTER_M = 40.0
+"""People enter in the outer part of the crowd's radius, so wide."""
+
+LINGER_M = 20.0
+"""How far beyond the crowd's radius a person may stray before it is taken out."""
+
+STUCK_S = 60.0
+"""A person that has waited this long, but not at a red light, is taken out."""
+
+EDGE_M = 0.4
+PERSONAL_SPACE_M = 1.5
+WALK_EDGES = 30
+BARRIER_MARGIN_M = 1.0
+PERSONS_AT_ONCE = 8
+
+VEHICLE_RING_M = (60.0, 220.0)
+VEHICLE_FIRST_M = 25.0
+VEHICLE_FAR_M = 120.0
+VEHICLE_REACH_M = 250.0
+VEHICLE_STUCK_S = 180.0
+ROUTE_EDGES = 60
+VEHICLES_AT_ONCE = 3
+
+VEHICLE_TYPES: Mapping[str, tuple[float, float, float]] = {
+    "small": (3.8, 1.7, 0.25),
+    "car": (4.6, 1.8, 0.55),
+    "van": (5.6, 2.0, 0.20),
+}
+"""Vehicle type -> length m, width m, share."""
+
+
+class Seen(NamedTuple):
+    """A person or vehicle near the robot: position (for vehicles of the front bumper) m, and seconds without moving."""
+
+    x_m: float
+    y_m: float
+    waiting_s: float
+
+
+class Pedestrians:
+    """The background persons."""
+
+    def __init__(
+        self,
+        engine: Any,
+        street_map: StreetMap,
+        spec: CrowdSpec,
+        rng: np.random.Generator,
+        closed: frozenset[Port],
+        together: Together,
+    ) -> None:
+        self._engine, self._spec, self._rng, self._closed = engine, spec, rng, closed
+        self._together = together
+        self._graph = WalkGraph(street_map)
+        self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
+        self._spots = Spots(
+            (
+                (s.id, s.line, self._margin_m(Port(s.id, 0)), self._margin_m(Port(s.id, 1)))
+                for s in street_map.strips.values()
+                if s.kind == "sidewalk"
+            ),
+            step_m=2.0,
+        )
+        self._count = 0
+        self._room = Room(street_map, spec.radius_m)
+        self._companies = Companies(spec, rng.spawn(1)[0])
+
+    def fill(self, x_m: float, y_m: float) -> None:
+        """Everybody at once, before the episode."""
+        self._enter(self.wanted(x_m, y_m), x_m, y_m, CLEAR_M, {})
+
+    def wanted(self, x_m: float, y_m: float) -> int:
+        """How many persons there should be within the crowd's radius of a point."""
+        if isinstance(self._spec.density, msgspec.UnsetType):
+            return self._spec.persons
+        return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
+
+    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen], at_red: Callable[[str], bool]) -> None:
+        """Take out who is far away or stuck, with all who walk along; let others in instead; keep groups together.
+
+        seen: the persons within the crowd's radius and LINGER_M. at_red: whether a person waits at a red light.
+        """
+        person, radius_m = self._engine.person, self._spec.radius_m
+        fellows = self._together.fellows
+        present = sorted(name for name in person.getIDList() if name.startswith("c"))
+        self._together.forget(present)
+        gone: set[str] = set()
+        for name in present:
+            here = seen.get(name)
+            if name in gone:
+                continue
+            if here is None or (here.waiting_s > STUCK_S and not any(at_red(fellow) for fellow in fellows(name))):
+                gone.update(fellows(name))
+                self._remove(name)
+        away_m = {name: math.hypot(p.x_m - x_m, p.y_m - y_m) for name, p in seen.items()}
+        inside = [name for name, far_m in away_m.items() if far_m < radius_m]
+        low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
+        missing = self.wanted(x_m, y_m) - len(inside)
+        if not isinstance(self._spec.density, msgspec.UnsetType):
+            far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
+            spare = -missing - (0 if self._companies.plain else 1)
+            for name in far:
+                if len(fellows(name)) <= spare:
+                    spare -= len(fellows(name))
+                    self._remove(name)
+        self._together.keep(seen)
+        self._enter(min(missing, PERSONS_AT_ONCE), x_m, y_m, low_m, seen)
+
+    def _remove(self, name: str) -> None:
+        """Take somebody who is still there out, with all who walk along."""
+        if name in self._engine.person.getIDList():
+            for fellow in self._together.leave(name):
+                self._engine.person.remove(fellow)
+
+    def _margin_m(self, port: Port) -> float:
+        return self._widths_m[port.strip] + END_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
+
+    def _enter(self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]) -> None:
+        if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
+            return
+        taken = [(p.x_m, p.y_m) for p in seen.values()]
+        for _ in range(4 * count):
+            company = self._companies.coming
+            if 2 * count < company.size:
+                return
+            spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
+            forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*company.pace_mps))
+            width_m = self._widths_m[spot.edge]
+            half_m = max(width_m / 2 - EDGE_M - (company.abreast(width_m) - 1) * STRIPE_M / 2, 0.0)
+            middle_m = float(self._rng.uniform(-half_m, half_m))
+            back = -1.0 if forward else 1.0
+            places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in company.places(width_m)]
+            if any(
+                np.hypot(x - other_x, y - other_y) < PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
+            ):
+                continue
+            walk = self._graph.wander(self._rng, spot.edge, forward, WALK_EDGES, self._closed)
+            if len(walk) == 1:
+                continue
+            walk, speed_mps = self._one_way(walk, forward), company.walks_at(drawn_mps)
+            names = [self._name(age) for age in company.ages]
+            for name, xy in zip(names, places, strict=True):
+                self._add(name, spot, walk, speed_mps, xy)
+            self._together.join(names, speed_mps, walk)
+            self._companies.entered()
+            taken += places
+            count -= company.size
+            if count <= 0:
+                return
+
+    def _one_way(self, walk: list[str], forward: bool) -> list[str]:
+        """A walk that SUMO takes in one direction only.
+
+        From one sidewalk onto another between the same junctions SUMO may set out in either direction, and dies where
+        the two do not meet: there the corner between them is named.
+        """
+        first, second = ({self._engine.edge.getFromJunction(e), self._engine.edge.getToJunction(e)} for e in walk[:2])
+        corner = self._graph.street_map.strips[walk[0]].corners[1 if forward else 0]
+        return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
+
+    def _name(self, age: str) -> str:
+        """The next name; a person's age follows from the name, so if it matters, the next name of that age."""
+        while age and age_of(f"c{self._count}") != age:
+            self._count += 1
+        self._count += 1
+        return f"c{self._count - 1}"
+
+    def _add(self, name: str, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
+        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
+        first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
+        self._engine.person.add(name, spot.edge, spot.share * first_m)
+        self._engine.person.appendWalkingStage(name, walk, last_m / 2, speed=speed_mps)
+        self._engine.person.moveToXY(name, "", *xy, heading_to_sumo(spot.pose.heading_rad), KEEP_ROUTE, MATCH_M)
+
+
+class Drivers:
+    """The vehicles."""
+
+    def __init__(self, engine: Any, street_map: StreetMap, spec: CrowdSpec, rng: np.random.Generator) -> None:
+        self._engine, self._spec, self._rng = engine, spec, rng
+        lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
+        self._lanes: dict[str, list[str]] = {}
+        lines: dict[str, Floats] = {}
+        for lane in lanes:
+            allowed = engine.lane.getAllowed(lane.id)
+            if not allowed or "passenger" in allowed:
+                self._lanes.setdefault(lane.edge, []).append(lane.id)
+                lines.setdefault(lane.edge, lane.line)
+        self._spots = Spots(((edge, line, 8.0, 12.0) for edge, line in lines.items()), step_m=10.0)
+        self._next: dict[str, tuple[str, ...]] = {}
+        self._size: dict[str, tuple[float, float]] = {}
+        self._count = 0
+        for kind, (length_m, width_m, _) in VEHICLE_TYPES.items():
+            engine.vehicletype.copy("DEFAULT_VEHTYPE", kind)
+            engine.vehicletype.setLength(kind, length_m)
+            engine.vehicletype.setWidth(kind, width_m)
+
+    def size_m(self, name: str) -> tuple[float, float]:
+        """Length and width of a vehicle in metres."""
+        return self._size[name]
+
+    def fill(self, x_m: float, y_m: float) -> None:
+        """All at once, before the episode."""
+        ring = self._spots.ring(x_m, y_m, VEHICLE_FIRST_M, VEHICLE_RING_M[1])
+        for _ in range(self._spec.vehicles if ring else 0):
+            self._enter(ring)
+
+    def roll(self, x_m: float, y_m: float, seen: Mapping[str, Seen]) -> None:
+        """Take out what is far away or stuck out of sight, let others in instead, far away when possible."""
+        vehicle = self._engine.vehicle
+        staying = 0
+        for name in sorted(vehicle.getIDList()):
+            here = seen.get(name)
+            if here is None or (
+                here.waiting_s > VEHICLE_STUCK_S and np.hypot(here.x_m - x_m, here.y_m - y_m) > VEHICLE_RING_M[0]
+            ):
+                vehicle.remove(name)
+                self._size.pop(name)
+            else:
+                staying += 1
+        missing = min(self._spec.vehicles - staying, VEHICLES_AT_ONCE)
+        if missing > 0:
+            ring = self._spots.ring(x_m, y_m, VEHICLE_FAR_M, VEHICLE_RING_M[1])
+            ring = ring or self._spots.ring(x_m, y_m, *VEHICLE_RING_M)
+            for _ in range(missing if ring else 0):
+                self._enter(ring)
+
+    def _enter(self, ring: list[int]) -> None:
+        spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
+        route = self._route(spot.edge)
+        kinds = list(VEHICLE_TYPES)
+        kind = kinds[int(self._rng.choice(len(kinds), p=[share for _, _, share in VEHICLE_TYPES.values()]))]
+        name = f"v{self._count}"
+        self._count += 1
+        position_m = spot.share * self._engine.lane.getLength(self._lanes[spot.edge][0])
+        self._engine.route.add(name, route)
+        self._engine.vehicle.add(name, name, typeID=kind, departLane="best", departPos=f"{position_m:.2f}")
+        self._size[name] = VEHICLE_TYPES[kind][:2]
+
+    def _route(self, edge: str) -> list[str]:
+        route = [edge]
+        while len(route) < ROUTE_EDGES and (choices := self._onward(route[-1])):
+            route.append(choices[int(self._rng.integers(len(choices)))])
+        return route
+
+    def _onward(self, edge: str) -> tuple[str, ...]:
+        """The edges a car can go on to; a turn back only where there is nothing else."""
+        if edge not in self._next:
+            onward: dict[str, bool] = {}
+            for lane in self._lanes[edge]:
+                for to, *_, turn, _ in self._engine.lane.getLinks(lane):
+                    to_edge = to.rsplit("_", 1)[0]
+                    if to in self._lanes.get(to_edge, ()):
+                        onward[to_edge] = turn in "tT" and onward.get(to_edge, True)
+            ahead = tuple(to for to, back in sorted(onward.items()) if not back)
+            self._next[edge] = ahead or tuple(sorted(onward))
+        return self._next[edge]

@@ -1,0 +1,261 @@
+"""Proxies: how SUMO's persons and cars see the robot and the event pedestrians.
+
+A proxy is a SUMO person that is put where its original is before every step. SUMO sees it only on the edges of its
+own walk and around the junction where the first of them ends, so the walk is chosen by the place and made anew when
+the place changes. Other ways of moving a person (free mapping, a walk of one walking area) crash SUMO.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import shapely
+from shapely.geometry import LineString
+
+from cosim.core.geometry import Pose, heading_to_sumo
+from cosim.place.street_map import Located, StreetMap
+
+KEEP_ROUTE = 3
+"""moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""
+
+KEEP_ROUTE_ON_ROAD = 7
+"""The same with car lanes allowed: cars stop for somebody on the carriageway."""
+
+MATCH_M = 100.0
+END_M = 2.0
+"""Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the corner."""
+
+NEARER_M = 0.01
+"""By how much the lines of its own place must be nearer to a proxy than those of others."""
+
+NUDGES = (0.0, 0.1, 0.2, 0.4, 0.7, 0.98)
+"""Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to others."""
+
+
+class Walk(NamedTuple):
+    """A walk of a proxy: from sidewalk `first` to sidewalk `second`, over the place `around` where they meet."""
+
+    around: str
+    first: str
+    second: str
+
+
+class Walks:
+    """Chooses a proxy's walk from where it is and where it heads.
+
+    A meeting place is named by the first of the corners that crossings of one junction join, or by the junction
+    where there is no corner. Sidewalks of one junction that do not meet make a walk that crashes SUMO.
+    """
+
+    def __init__(self, engine: Any, street_map: StreetMap) -> None:
+        self.street_map = street_map
+        self._place = _meeting_places(street_map)
+        self._ends: dict[str, tuple[str, str]] = {}
+        self._into: dict[str, list[str]] = {}
+        self._at: dict[str, list[str]] = {}
+        self._best: dict[str, Walk | None] = {}
+        self._line: Callable[[str], shapely.Geometry] = lambda edge: _line(engine, edge)
+        self._inner = _inner_pieces(engine.edge.getIDList())
+        self._lines: dict[Walk, tuple[shapely.Geometry, shapely.Geometry] | None] = {}
+        for strip in street_map.strips.values():
+            if strip.kind == "sidewalk":
+                ends = (engine.edge.getFromJunction(strip.id), engine.edge.getToJunction(strip.id))
+                self._ends[strip.id] = ends
+                for end in (0, 1):
+                    for place in {self._meeting(strip.id, end): 0, ends[end]: 0}:
+                        self._at.setdefault(place, []).append(strip.id)
+                        if end == 1:
+                            self._into.setdefault(place, []).append(strip.id)
+
+    def serves(self, walk: Walk, edge: str, pose: Pose) -> bool:
+        """Whether SUMO sees a proxy on `edge` when it has `walk`."""
+        if edge.startswith(":"):
+            best = self.choose(edge, pose)
+            return best == walk or (
+                best is not None
+                and walk.around == best.around
+                and walk.first in self._into[walk.around]
+                and self._touched(walk, edge) >= self._touched(best, edge)
+            )
+        return walk.first == edge and walk.around == self._ahead(edge, pose)
+
+    def choose(self, edge: str, pose: Pose) -> Walk | None:
+        """A walk on which SUMO sees a proxy on `edge`; None where there is none."""
+        if edge.startswith(":"):
+            if edge not in self._best:
+                around = self._inside(edge)
+                self._best[edge] = self._pair(around, self._into.get(around, []), edge)
+            return self._best[edge]
+        if edge in self._ends:
+            return self._pair(self._ahead(edge, pose), [edge], edge)
+        return None
+
+    def seen_at(self, walk: Walk, x_m: float, y_m: float) -> tuple[float, float] | None:
+        """The place nearest to a point, in metres, at which SUMO can see a proxy with a walk; None without any.
+
+        Where the corners of a junction are not joined by crossings, SUMO may take a proxy on one to be on another.
+        """
+        if walk not in self._lines:
+            self._lines[walk] = self._own_and_others(walk)
+        lines = self._lines[walk]
+        if lines is None:
+            return x_m, y_m
+        own, others = lines
+        to_own = shapely.get_coordinates(shapely.shortest_line(shapely.Point(x_m, y_m), own))
+        for share in NUDGES:
+            x, y = (to_own[0] + share * (to_own[1] - to_own[0])).tolist()
+            if shapely.distance(own, at := shapely.Point(x, y)) + NEARER_M < shapely.distance(others, at):
+                return x, y
+        return None
+
+    def _own_and_others(self, walk: Walk) -> tuple[shapely.Geometry, shapely.Geometry] | None:
+        """The lines that SUMO compares with a proxy's position: of its walk and place, of the junction's other places.
+
+        None where there are no others.
+        """
+        inner = self._inner.get(self._ends[walk.first][1], [])
+        others = [piece for piece in inner if self._place.get(piece) != walk.around]
+        if not others:
+            return None
+        own = [walk.first, walk.second, *(piece for piece in inner if self._place.get(piece) == walk.around)]
+        return shapely.union_all([*map(self._line, own)]), shapely.union_all([*map(self._line, others)])
+
+    def _pair(self, around: str, firsts: list[str], edge: str) -> Walk | None:
+        """The walk that touches most corners of `edge`, if possible not from one side of a street to its other."""
+        walks = [Walk(around, first, to) for first in firsts for to in self._at.get(around, []) if to != first]
+        return max(
+            walks,
+            key=lambda walk: (self._touched(walk, edge), self._ends[walk.second] != self._ends[walk.first][::-1]),
+            default=None,
+        )
+
+    def _touched(self, walk: Walk, edge: str) -> int:
+        """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its path there."""
+        strips = self.street_map.strips
+        corners = strips[edge].corners if edge in strips else (edge,)
+        return sum(
+            corner is not None and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
+            for corner in corners
+        )
+
+    def _inside(self, edge: str) -> str:
+        """The meeting place of a corner or crossing; the junction of any other edge inside one."""
+        return self._place.get(edge) or junction_of(edge)
+
+    def _meeting(self, strip: str, end: int) -> str:
+        corner = self.street_map.strips[strip].corners[end]
+        return self._ends[strip][end] if corner is None else self._place[corner]
+
+    def _ahead(self, edge: str, pose: Pose) -> str:
+        """The meeting place at the end of a sidewalk that a pose heads to.
+
+        Near the end where the edge ends it is always that one: SUMO may map a proxy there to the walking area, and
+        crashes when its walk turns away from it.
+        """
+        strip = self.street_map.strips[edge]
+        (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
+        forward = (x1 - x0) * math.cos(pose.heading_rad) + (y1 - y0) * math.sin(pose.heading_rad) >= 0.0
+        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + END_M
+        return self._meeting(edge, 1 if forward or at_end else 0)
+
+
+class Proxy:
+    """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after another."""
+
+    def __init__(self, engine: Any, walks: Walks, *, base: str, kind: str, serial: Iterator[int]) -> None:
+        self._engine = engine
+        self._walks = walks
+        self._base, self._kind, self._serial = base, kind, serial
+        self._name: str | None = None
+        self._walk: Walk | None = None
+        self._point: tuple[float, float] | None = None
+        self._place = Located("off", "")
+        self._piece: shapely.Geometry | None = None
+
+    def update(self, pose: Pose) -> None:
+        """Put it at a pose. To be called before every step of the simulation, or it walks on by itself."""
+        x_m, y_m, heading_rad = pose
+        place = self._locate(x_m, y_m)
+        walk = self._walk
+        if place.kind == "off":
+            walk = None
+        elif walk is None or not self._walks.serves(walk, place.edge, pose):
+            walk = self._walks.choose(place.edge, pose)
+        mode = KEEP_ROUTE_ON_ROAD if place.kind == "road" else KEEP_ROUTE
+        at = (x_m, y_m)
+        if walk is not None and mode == KEEP_ROUTE:
+            seen_at = self._walks.seen_at(walk, x_m, y_m)
+            walk, at = (None, at) if seen_at is None else (walk, seen_at)
+        if walk != self._walk or self._name is None:
+            self.remove()
+            if walk is not None:
+                self._add(walk)
+        if self._name is not None:
+            self._engine.person.moveToXY(self._name, "", *at, heading_to_sumo(heading_rad), mode, MATCH_M)
+
+    def remove(self) -> None:
+        """Take it out of the simulation."""
+        if self._name is not None and self._name in self._engine.person.getIDList():
+            self._engine.person.remove(self._name)
+        self._name = self._walk = None
+
+    def _add(self, walk: Walk) -> None:
+        person = self._engine.person
+        self._name, self._walk = f"{self._base}.{next(self._serial)}", walk
+        lengths = [self._engine.lane.getLength(f"{edge}_0") for edge in (walk.first, walk.second)]
+        person.add(self._name, walk.first, lengths[0] / 2, typeID=self._kind)
+        person.appendWalkingStage(self._name, [walk.first, walk.second], lengths[1] / 2)
+
+    def _locate(self, x_m: float, y_m: float) -> Located:
+        """The map's `locate`, asked again only when the body has left the walkable piece where it was."""
+        if self._point == (x_m, y_m):
+            return self._place
+        self._point = (x_m, y_m)
+        if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
+            street_map = self._walks.street_map
+            self._place = place = street_map.locate(x_m, y_m)
+            self._piece = None
+            if place.kind == "walk":
+                piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
+                self._piece = piece.polygon
+                shapely.prepare(self._piece)
+        return self._place
+
+
+def junction_of(internal: str) -> str:
+    """The junction of a walking area, crossing or internal edge: "a_b" of ":a_b_w0"."""
+    return internal[1:].rsplit("_", 1)[0]
+
+
+def _inner_pieces(edges: Iterable[str]) -> dict[str, list[str]]:
+    """Junction -> its walking areas and crossings, those included that are too small for the map."""
+    inner: dict[str, list[str]] = {}
+    for edge in edges:
+        if edge.startswith(":") and edge.rsplit("_", 1)[1][0] in "wc":
+            inner.setdefault(junction_of(edge), []).append(edge)
+    return inner
+
+
+def _line(engine: Any, edge: str) -> shapely.Geometry:
+    """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a walking area."""
+    return LineString([point[:2] for point in engine.lane.getShape(f"{edge}_0")])
+
+
+def _meeting_places(street_map: StreetMap) -> dict[str, str]:
+    """Corner or crossing id -> id of the first of the corners that it is joined with by crossings."""
+    place = {corner: corner for corner in street_map.corners}
+
+    def root(corner: str) -> str:
+        while place[corner] != corner:
+            corner = place[corner]
+        return corner
+
+    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
+    for crossing in crossings:
+        joined = sorted({root(corner) for corner in crossing.corners if corner is not None})
+        for corner in joined:
+            place[corner] = joined[0]
+    roots = {corner: root(corner) for corner in place}
+    return roots | {c.id: roots[c.corners[0] or c.corners[1] or ""] for c in crossings if any(c.corners)}

@@ -1,0 +1,250 @@
+"""Mapped buildings and things brought among the streets of a net: what is in the way is moved, cut back or left out.
+
+A net's streets are not where they are in the world to the decimetre, and its widths are often guesses: trees of the
+curb come to lie on the road, houses on the sidewalk. The walkable area wins.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from typing import Final, cast
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Point, Polygon
+
+from cosim.core.geometry import Floats
+from cosim.place import overlay
+from cosim.place.street_map import Feature, FeatureKind, Lane, StreetMap, Strip
+from sumo_nets.maps.osmfeatures import Found, Mapped
+from sumo_nets.maps.utm import utm_xy, utm_zone
+
+EXTENT_M: Final[Mapping[str, tuple[float, float]]] = {
+    "tree": (0.4, 0.4), "lamp": (0.16, 0.16), "bench": (1.9, 0.55), "bollard": (0.18, 0.18),
+    "bin": (0.56, 0.56), "hydrant": (0.32, 0.32), "rack": (1.5, 0.75),
+}  # fmt: skip
+"""Length and depth of the ground that each thing may cover."""
+
+CLEAR_HALF_M: Final = 0.6
+EDGE_M: Final = 0.6
+"""Along the middle of a sidewalk a band stays clear: 1.2 m wide at least, and all but its outer 0.6 m."""
+WALL_M: Final = 0.2
+"""Least distance of a building from anything walked or driven on."""
+GAP_M: Final = 0.1
+MOVED_M: Final = 3.0
+"""Things are moved up to so far to where they may stand."""
+_CELL_M: Final = 2.5
+"""Side of the cells in which things look for others: no two that touch are farther apart."""
+FAR_M: Final = 100.0
+"""What is farther from every walkway is left out."""
+IN_ZONE_DEG: Final = 10.0
+"""What is farther from the middle of the net's UTM zone is no part of the map."""
+LEFT_SHARE: Final = 0.5
+LEFT_M2: Final = 6.0
+"""A building stays when this much of it is left after the streets have been cut out."""
+
+
+def fitted(found: Found, location: Mapping[str, str], street_map: StreetMap) -> tuple[tuple[Feature, ...], list[str]]:
+    """The features of a map in its net's frame, and what was done to them, a sentence each.
+
+    location: the attributes of the net's <location>.
+    """
+    zone = utm_zone(location.get("projParameter", ""))
+    if not found.things:
+        return (), []
+    if zone is None:
+        return (), [f"{len(found.things)} buildings and things left out: the net has no UTM projection"]
+    offset = np.array([float(v) for v in location["netOffset"].split(",")])
+    around = [thing for thing in found.things if _in_zone(thing, zone[0])]
+    mapped = [thing._replace(rings=tuple(utm_xy(ring, *zone) + offset for ring in thing.rings)) for thing in around]
+    near = _near(mapped, street_map)
+    streets = _Streets(street_map)
+    buildings, told = _cut_back([thing for thing in near if thing.kind == "building"], streets)
+    standing, more = _settled([thing for thing in near if thing.kind != "building"], streets, buildings)
+    kinds = Counter(feature.kind for feature in (*buildings, *standing))
+    words = [f"{count} x {kind}" for kind, count in kinds.items()]
+    changes = [f"taken from the map: {', '.join(words)}"] if words else []
+    left_out = [f"{count} x {reason}" for reason, count in found.skipped.items()]
+    if left_out:
+        changes.append(f"left out: {', '.join(left_out)}")
+    return (*buildings, *standing), [*changes, *told, *more]
+
+
+def _in_zone(thing: Mapped, zone: int) -> bool:
+    """Whether a thing is so near to the zone's middle that the projection holds for it."""
+    east = np.remainder(thing.rings[0][:, 0] - (6.0 * zone - 183.0) + 180.0, 360.0) - 180.0
+    return bool((np.abs(east) < IN_ZONE_DEG).all())
+
+
+def _near(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
+    walked = [strip.polygon for strip in street_map.strips.values()]
+    if not walked or not mapped:
+        return []
+    outlines = [shapely.LineString(t.rings[0]) if len(t.rings[0]) > 1 else Point(t.rings[0][0]) for t in mapped]
+    hit, _ = shapely.STRtree(walked).query(outlines, predicate="dwithin", distance=FAR_M)
+    return [mapped[i] for i in np.unique(hit)]
+
+
+class _Streets:
+    """The ground that streets take: walked and driven on, and what of it must stay clear of posts."""
+
+    def __init__(self, street_map: StreetMap) -> None:
+        strips = list(street_map.strips.values())
+        lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road"]
+        ground: list[shapely.Geometry] = [lane.polygon for lane in lanes]
+        ground += [corner.polygon for corner in street_map.corners.values()]
+        self._ground = _Index([*ground, *(strip.polygon for strip in strips)])
+        self._closed = _Index([*ground, *(_band(strip) for strip in strips)])
+        self._roads = _Lines(lanes)
+        self._walks = _Lines([strip for strip in strips if strip.kind == "sidewalk"])
+
+    def under(self, area: shapely.Geometry) -> shapely.Geometry:
+        """What is walked or driven on within an area."""
+        return self._ground.union(area, 0.0)
+
+    def closed(self, at: Point) -> shapely.Geometry:
+        """Where nothing may stand, around a point."""
+        return self._closed.union(at, 2.0 * MOVED_M)
+
+    def heading(self, kind: str, at: Point | Polygon) -> float:
+        """How a thing stands there: a lamp's arm over the road, a bench facing the walk, a building's front to the
+        street, the rest along it."""
+        over_road = self._roads.toward(at)
+        to_walk = self._walks.toward(at)
+        faced = to_walk if kind == "bench" or over_road is None else over_road
+        if kind in ("bench", "building") and faced is not None:
+            return math.remainder(faced + 0.5 * math.pi, 2.0 * math.pi)
+        toward = over_road if over_road is not None else to_walk
+        return 0.0 if toward is None else math.remainder(toward - 0.5 * math.pi, 2.0 * math.pi)
+
+
+class _Index:
+    """Polygons found by place."""
+
+    def __init__(self, polygons: Sequence[shapely.Geometry]) -> None:
+        self._polygons = np.array(polygons, dtype=object)
+        self._tree = shapely.STRtree(self._polygons)
+
+    def union(self, area: shapely.Geometry, within_m: float) -> shapely.Geometry:
+        near = np.sort(self._tree.query(area, predicate="dwithin", distance=within_m))
+        return overlay.union_all(self._polygons[near])
+
+
+class _Lines:
+    """Middle lines of lanes or strips, and the way to the nearest of them."""
+
+    def __init__(self, pieces: Sequence[Lane] | Sequence[Strip]) -> None:
+        self._lines: NDArray[np.object_] = np.array([shapely.LineString(p.line[:, :2]) for p in pieces], dtype=object)
+        self._tree = shapely.STRtree(self._lines)
+
+    def toward(self, at: Point | Polygon) -> float | None:
+        """Heading from a place to the nearest line within 30 m."""
+        nearest = self._tree.query_nearest(at, max_distance=30.0, all_matches=False)
+        if not len(nearest):
+            return None
+        (x0, y0), (x1, y1) = shapely.get_coordinates(shapely.shortest_line(at, self._lines[nearest[0]])).tolist()
+        return math.atan2(y1 - y0, x1 - x0)
+
+
+def _band(strip: Strip) -> shapely.Geometry:
+    """The part of a strip where nothing may stand: all of a crossing and more, the middle of a sidewalk."""
+    if strip.kind == "crossing":
+        return shapely.buffer(strip.polygon, 1.0)
+    half = max(CLEAR_HALF_M, 0.5 * strip.width_m - EDGE_M)
+    if half >= 0.5 * strip.width_m:
+        return strip.polygon
+    return shapely.buffer(shapely.LineString(strip.line[:, :2]), half)
+
+
+def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature], list[str]]:
+    """Buildings without the ground of streets."""
+    found: list[Feature] = []
+    cut = dropped = 0
+    for thing in mapped:
+        whole = Polygon(thing.rings[0], thing.rings[1:])
+        if not whole.is_valid:
+            dropped += 1  # valid in degrees, and too thin for metres
+            continue
+        parts = [whole]
+        taken = streets.under(shapely.buffer(whole, WALL_M))
+        if not shapely.is_empty(taken):
+            parts = _without(whole, taken)
+            left = sum(part.area for part in parts) > LEFT_SHARE * whole.area
+            cut += left
+            dropped += not left
+            parts = parts if left else []
+        for part in parts:
+            x, y = shapely.get_coordinates(shapely.point_on_surface(part))[0].tolist()
+            heading = round(_front(part, streets.heading("building", part)), 4)
+            found.append(Feature("building", round(x, 2), round(y, 2), heading, round(thing.height_m, 2), part))
+    told = []
+    if cut:
+        told.append(f"buildings cut back where they reached into streets (what is walked on wins): {cut}")
+    if dropped:
+        told.append(f"buildings left out that lay mostly on streets or are none: {dropped}")
+    return found, told
+
+
+def _front(part: Polygon, heading_rad: float) -> float:
+    """Heading along the wall that fronts the street best, for a street to the right of `heading_rad`."""
+    ring = shapely.get_coordinates(shapely.orient_polygons(part).exterior)
+    sides = np.diff(ring, axis=0)
+    # Walls run with the outside to their right: one that fronts the street runs along the heading.
+    fit = sides @ np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    x, y = sides[int(np.argmax(fit * (fit > 0.7 * np.hypot(*sides.T))))].tolist()
+    return math.atan2(y, x)
+
+
+def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
+    """What is left of a building off the streets, splinters left out."""
+    ground = shapely.buffer(taken, WALL_M, join_style="mitre", mitre_limit=2.0)
+    left = shapely.simplify(overlay.difference(whole, ground), 0.05)
+    left = shapely.buffer(shapely.buffer(left, -0.3, join_style="mitre"), 0.3, join_style="mitre", mitre_limit=2.0)
+    # Mitres may reach out again, and corners lie on the centimetre in the file.
+    left = shapely.set_precision(overlay.difference(overlay.intersection(left, whole), ground), 0.01)
+    return [p for p in shapely.get_parts(left) if isinstance(p, Polygon) and p.is_valid and p.area >= LEFT_M2]
+
+
+def _settled(
+    mapped: Sequence[Mapped], streets: _Streets, buildings: Sequence[Feature]
+) -> tuple[list[Feature], list[str]]:
+    """Things where they may stand, each a little aside of where it was mapped if need be, or left out."""
+    houses = _Index([building.polygon for building in buildings])
+    found: list[Feature] = []
+    stood: dict[tuple[int, int], list[tuple[Floats, float]]] = defaultdict(list)
+    counts: Counter[str] = Counter()
+    for thing in mapped:
+        radius = 0.5 * math.hypot(*EXTENT_M[thing.kind])
+        spot = Point(thing.rings[0][0])
+        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * MOVED_M))
+        at = _free_spot(spot, closed, radius)
+        if at is None:
+            counts["left out on a road, a crossing or in a narrow passage"] += 1
+            continue
+        xy = np.array([round(at.x, 2), round(at.y, 2)])
+        i, j = (math.floor(c / _CELL_M) for c in xy)
+        rivals = [rival for a in (-1, 0, 1) for b in (-1, 0, 1) for rival in stood.get((i + a, j + b), ())]
+        if any(np.hypot(*(xy - other)) < radius + reach + GAP_M for other, reach in rivals):
+            counts["left out where another one stands"] += 1
+            continue
+        if at is not spot:
+            counts["moved aside by up to 3 m, off the road or the middle of a sidewalk"] += 1
+        stood[i, j].append((xy, radius))
+        facing = thing.facing_rad
+        turned = streets.heading(thing.kind, at) if facing is None else facing + 0.5 * math.pi
+        heading = round(math.remainder(turned, 2.0 * math.pi), 4)
+        kind = cast(FeatureKind, thing.kind)
+        found.append(Feature(kind, float(xy[0]), float(xy[1]), heading, round(thing.height_m, 2)))
+    return found, [f"mapped things {what}: {count}" for what, count in counts.items()]
+
+
+def _free_spot(spot: Point, closed: shapely.Geometry, radius_m: float) -> Point | None:
+    """The nearest point where a disk keeps off what is closed; None when it is too far away."""
+    if shapely.is_empty(closed) or spot.distance(closed) > radius_m:
+        return spot
+    edge = shapely.boundary(shapely.buffer(closed, radius_m + 0.02))
+    _, at = (Point(p) for p in shapely.get_coordinates(shapely.shortest_line(spot, edge)))
+    return at if spot.distance(at) <= MOVED_M else None

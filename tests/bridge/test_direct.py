@@ -1,0 +1,302 @@
+"""`cosim direct` beside `cosim run --director`: real processes, real kill -9."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from cosim.cli.live import LONGEST_WAIT_S
+from cosim.episode.control import Command
+from cosim.episode.ports import Manifest, Observation
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from scenarios.execution.directing import directed
+from tests.conftest import PATIENCE_S, Cosim
+
+pytestmark = pytest.mark.engine
+
+WORDS = [sys.executable, "-m", "cosim"]
+
+KILLER = """
+import os, signal
+from pathlib import Path
+from cosim.episode.ports import Manifest
+from cosim.core.state import Command
+
+class Killer:
+    manifest = Manifest("blind", camera=None)
+    def reset(self, scenario_id, seed):
+        self.tick = 0
+    def act(self, observation):
+        self.tick += 1
+        if self.tick == 20:  # after 4 of 8 s: the event's pedestrian is on its way
+            os.kill(int(Path("director.pid").read_text()), signal.SIGKILL)
+        return Command(1.2, 0.0)
+"""
+
+BLIND = """
+from cosim.episode.ports import Manifest
+from cosim.core.state import Command
+
+class Blind:
+    manifest = Manifest("blind", camera=None)
+    def reset(self, scenario_id, seed): pass
+    def act(self, observation): return Command(1.2, 0.0)
+"""
+
+LIAR = """
+import sys, time
+import msgspec
+from bridge import keys
+from bridge.codec import decode, encode
+from bridge.director import Signed, opened, signed
+from bridge.session import Session
+from cosim.spec.events import EventQuery
+from scenarios.events import react
+from scenarios.execution.directing import behaviours
+
+last = {}
+def lie(payload):
+    query = opened(payload, EventQuery, behaviours())
+    reply, by, replace = react(query), behaviours(), msgspec.structs.replace
+    before, last[query.episode] = last.get(query.episode, reply), reply
+    if query.tick < 3 or query.episode == "honest":
+        return signed(reply, by)
+    match query.episode:
+        case "late": return signed(before, by)
+        case "many": return signed(replace(reply, states=reply.states * 1000), by)
+        case "noise": return b"\\x93\\x01" * 100
+        case "other-code": return signed(reply, "0" * 16)
+        case "huge": return signed(reply, "x" * 10_000_000)
+    raise RuntimeError("no idea")
+
+with Session.hub(sys.argv[1]) as hub:
+    hub.serve(keys.EVERY_DIRECTOR, lie)
+    print("lying", flush=True)
+    time.sleep(3600)
+"""
+
+
+class Blind:
+    """Drives straight on, like the one that kills."""
+
+    manifest = Manifest("blind", camera=None)
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(1.2, 0.0)
+
+
+def frontal(scenario_id: str) -> Scenario:
+    """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the robot."""
+    from scenarios.builders.reactive import build
+    from scenarios.execution.places import place
+
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    whole = build("frontal", city, street_map, WalkGraph(street_map), 1, scenario_id)
+    return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
+
+
+def started(folder: Path, *words: str) -> subprocess.Popen[str]:
+    """A process that has said its first line."""
+    process = subprocess.Popen(words, cwd=folder, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None and process.stdout.readline()
+    return process
+
+
+def recorded(folder: Path, scenario_id: str) -> dict[str, Any]:
+    return json.loads((folder / "run" / "episodes" / scenario_id / "record.json").read_bytes())
+
+
+@contextmanager
+def directing(folder: Path) -> Iterator[Callable[[], subprocess.Popen[str]]]:
+    """Starts `cosim direct` in a folder, as often as called; the policy Killer knows of the last one."""
+    started_here: list[subprocess.Popen[str]] = []
+
+    def start() -> subprocess.Popen[str]:
+        started_here.append(started(folder, *WORDS, "direct", "--listen", at_socket(folder)))
+        (folder / "director.pid").write_text(str(started_here[-1].pid))
+        return started_here[-1]
+
+    try:
+        yield start
+    finally:
+        for process in started_here:
+            process.kill()
+            process.communicate()
+
+
+def at_socket(folder: Path) -> str:
+    return f"unixsock-stream/{folder}/director.sock"
+
+
+def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
+    """Killed and started again the episode comes to the hash of an undisturbed one."""
+    from scenarios.execution.run import episode
+
+    write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-0"),)), tmp_path / "tiny.json")
+    (tmp_path / "killer.py").write_text(KILLER)
+    words = ("run", "tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at_socket(tmp_path))
+    with directing(tmp_path) as direct:
+        first = direct()
+        run = subprocess.Popen(
+            [*WORDS, *words, "--director-wait", str(LONGEST_WAIT_S)], cwd=tmp_path, stdout=subprocess.DEVNULL
+        )
+        try:
+            undisturbed = episode(frontal("t-0"), Blind()).record
+            assert first.wait(timeout=PATIENCE_S) == -9
+            direct()
+            assert run.wait(timeout=PATIENCE_S) == 0
+        finally:
+            run.kill()
+            run.wait()
+    kept = recorded(tmp_path, "t-0")
+    assert undisturbed.status == "done" and undisturbed.events[0].triggered_at_s == 1.5
+    assert kept["status"] == "done" and kept["state_hash"] == undisturbed.state_hash
+
+
+def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> None:
+    """Killed for good while an episode runs: the run says that it waits, and that episode has crashed."""
+    write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json")
+    (tmp_path / "killer.py").write_text(KILLER)
+    words = ("run", "tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at_socket(tmp_path))
+    with directing(tmp_path) as direct:
+        direct()
+        run = cosim(*words, "--director-wait", "5", cwd=tmp_path)
+    lost = recorded(tmp_path, "t-1")
+    assert run.returncode == 1 and lost["status"] == "crashed"
+    assert "nobody answered on 'cosim/run/env/t-1/director' for 5 s" in lost["reason"]
+    assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
+
+
+def test_a_director_that_lies_crashes_its_episodes_and_no_other(tmp_path: Path, cosim: Cosim) -> None:
+    """The last tick's answer, too many states, noise, other code, an exception: each a record with its reason."""
+    says = {
+        "late": "it answered tick 2 of 'late'",
+        "many": "it answered with 1000 states for 1 events",
+        "noise": "not a Signed message",
+        "other-code": "run and director must be started from the same code",
+        "huge": "Expected `str` of length <= 64",
+        "raises": "RuntimeError: no idea",
+    }
+    scenarios = tuple(frontal(name) for name in ("honest", *says))
+    write_suite(Suite(name="tiny", version="1", scenarios=scenarios), tmp_path / "tiny.json")
+    (tmp_path / "liar.py").write_text(LIAR)
+    (tmp_path / "blind.py").write_text(BLIND)
+    at = f"unixsock-stream/{tmp_path}/liar.sock"
+    liar = started(tmp_path, sys.executable, "liar.py", at)
+    try:
+        words = ("run", "tiny.json", "--policy", "blind:Blind", "--out", "run", "--director", at)
+        run = cosim(*words, cwd=tmp_path)
+    finally:
+        liar.kill()
+        liar.wait()
+    assert run.returncode == 1 and recorded(tmp_path, "honest")["status"] == "done", run.stderr
+    for name, words in says.items():
+        record = recorded(tmp_path, name)
+        assert record["status"] == "crashed" and words in record["reason"] and len(record["reason"]) < 1000
+        assert f"director, tick 3 of '{name}'" in record["reason"]
+
+
+def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cosim: Cosim) -> None:
+    """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is an error."""
+    from bridge.director import Outside
+    from cosim.core.errors import DirectorLost
+    from cosim.spec.events import EventQuery
+    from scenarios.execution.directing import directed_by
+
+    at = f"unixsock-stream/{tmp_path}/director.sock"
+    query = EventQuery(
+        episode="e", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
+        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
+    )  # fmt: skip
+    told: list[str] = []
+    with (
+        pytest.raises(
+            DirectorLost, match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct"
+        ),
+        directed_by(Outside(endpoint=at, run="r", wait_s=0.5), told.append, "e"),
+    ):
+        pass
+    directors: list[subprocess.Popen[str]] = []
+    late = threading.Thread(target=lambda: directors.append(started(tmp_path, *WORDS, "direct", "--listen", at)))
+    late.start()
+    try:
+        with directed_by(Outside(endpoint=at, run="r", wait_s=PATIENCE_S), told.append, "e") as director:
+            assert director.react(query).tick == 0
+        late.join()
+        second = cosim("direct", "--listen", at)
+        assert second.returncode == 3 and f"cannot listen at {at}" in second.stderr
+        directors[0].terminate()
+        assert directors[0].wait(timeout=PATIENCE_S) == 130
+    finally:
+        late.join()
+        for process in directors:
+            process.kill()
+            process.wait()
+    bad = cosim("direct", "--listen", "7448")
+    assert bad.returncode == 2 and "--listen '7448': write it as PROTOCOL/ADDRESS" in bad.stderr
+
+
+def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> None:
+    """The modules whose source is hashed hold all that a fresh process has loaded with them."""
+    from scenarios.execution.directing import behaviours, sources
+
+    code = "import sys, scenarios.events; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
+    assert {"scenarios.events.frontal", "cosim.spec.events"} < ours <= set(sources("scenarios.events"))
+    assert len(behaviours()) == 16 and behaviours() == behaviours()
+
+
+HELD = """
+import sys, time
+from scenarios.execution.directing import directed
+with directed(sys.argv[1]):
+    print("here", flush=True)
+    time.sleep(3600.0)
+"""
+
+
+def test_the_folder_of_an_episode_that_was_killed_goes_when_the_next_one_begins(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once it is old enough; not that of an episode that runs, and nothing else."""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    lasting = tmp_path / "cosim-zenoh-notes"
+    lasting.mkdir()
+    folders: list[Path] = []
+    processes: list[subprocess.Popen[str]] = []
+    try:
+        for name in ("killed", "running"):
+            words, environment = [sys.executable, "-c", HELD, name], os.environ | {"TMPDIR": str(tmp_path)}
+            processes.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment))
+            assert processes[-1].stdout is not None and processes[-1].stdout.readline() == "here\n"
+            folders += {*tmp_path.glob("cosim-zenoh-*")} - {lasting, *folders}
+        killed, running = folders
+        processes[0].kill()
+        processes[0].wait()
+        with directed("young"):
+            assert killed.is_dir()
+        for folder in folders:
+            os.utime(folder, (0.0, 0.0))
+        with directed("next"):
+            assert not killed.exists() and (running / "hub.sock").exists() and lasting.is_dir()
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()

@@ -1,0 +1,202 @@
+"""The director over real Zenoh sessions."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from bridge import keys
+from bridge.codec import decode, encode
+from bridge.director import RemoteDirector, opened, serve_director, signed
+from bridge.session import Session
+from cosim.core.errors import DirectorLost, EngineError, SpecError
+from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
+from tests.conftest import PATIENCE_S
+
+pytestmark = pytest.mark.engine
+
+KEY = keys.director("test", "env")
+
+
+def query(tick: int = 0) -> EventQuery:
+    return EventQuery(
+        episode="t", tick=tick, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
+        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
+    )  # fmt: skip
+
+
+def echo(asked: EventQuery) -> EventReply:
+    return EventReply(episode=asked.episode, tick=asked.tick, states=(), actors=())
+
+
+def endpoint(folder: Path) -> str:
+    return f"unixsock-stream/{folder}/hub.sock"
+
+
+def test_every_tick_is_answered_in_lockstep(tmp_path: Path) -> None:
+    """A thousand queries get a thousand replies, each to its own tick."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, echo)
+        director = RemoteDirector(client, KEY)
+        assert [director.react(query(tick)).tick for tick in range(1000)] == list(range(1000))
+
+
+def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> None:
+    """An exception in the director comes back as the reason, not as silence."""
+
+    def broken(asked: EventQuery) -> EventReply:
+        raise RuntimeError("no idea")
+
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, broken)
+        with pytest.raises(DirectorLost, match=r"tick 7 of 't'.*RuntimeError: no idea"):
+            RemoteDirector(client, KEY).react(query(7))
+
+
+def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
+    """Nobody on the key: asked again until the time is over, then an error that says so."""
+    with Session.hub(endpoint(tmp_path)), Session.client(endpoint(tmp_path)) as client:
+        began = time.monotonic()
+        with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
+            RemoteDirector(client, KEY, wait_s=0.5).react(query())
+        assert time.monotonic() - began > 0.4
+
+
+def test_a_director_that_restarts_is_found_again(tmp_path: Path) -> None:
+    """The director's session closes and another takes its place: the next query is answered."""
+    with Session.hub(endpoint(tmp_path)), Session.client(endpoint(tmp_path)) as client:
+        director = RemoteDirector(client, KEY)
+        for tick in range(3):
+            with Session.client(endpoint(tmp_path)) as server:
+                serve_director(server, KEY, echo)
+                assert director.react(query(tick)).tick == tick
+
+
+def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
+    """A reply that belongs to another tick or episode is a protocol error."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()))
+        with pytest.raises(DirectorLost, match="answered tick 1"):
+            RemoteDirector(client, KEY).react(query(0))
+
+
+def event(**fields: object) -> Event:
+    known: dict[str, object] = {"id": "e0", "kind": "frontal", "x_m": 0.0, "y_m": 0.0, "heading_rad": 0.0}
+    return Event(**known | {"route_s_m": 5.0, "half_width_m": 1.0} | fields)  # type: ignore[arg-type]
+
+
+SANE = EventState(phase="waiting", since_tick=0, walkers=(Walker(x_m=1.0, y_m=0.0, heading_rad=0.0),))
+NOWHERE = msgspec.structs.replace(SANE, walkers=(Walker(x_m=math.nan, y_m=0.0, heading_rad=0.0),))
+CROWDED = msgspec.structs.replace(SANE, walkers=SANE.walkers * 3)
+SHOWN = Actor(id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand")
+FAST = msgspec.structs.replace(SHOWN, speed_mps=math.inf)
+STRANGER = msgspec.structs.replace(SHOWN, id="e7")
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"tick": 4}, "it answered tick 4 of 't'"),
+        ({"episode": "u"}, "it answered tick 5 of 'u'"),
+        ({"states": ()}, "0 states for 1 events"),
+        ({"states": (SANE,) * 10_000}, "10000 states for 1 events"),
+        ({"states": (CROWDED,)}, "or with other people"),
+        ({"states": (NOWHERE,)}, "no number"),
+        ({"actors": (FAST,)}, "no number"),
+        ({"actors": (STRANGER,)}, "people of no event, or twice: e7"),
+        ({"actors": (SHOWN, SHOWN)}, "people of no event, or twice"),
+    ],
+)
+def test_a_reply_that_cannot_be_meant_is_refused_in_words(tmp_path: Path, fields: dict[str, Any], words: str) -> None:
+    """The last tick's, another episode's, too many states, people of nobody, places that are none."""
+    asked = msgspec.structs.replace(query(5), events=(event(),))
+    sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {}))
+        director = RemoteDirector(client, KEY)
+        assert director.react(asked) == sane
+        asked = msgspec.structs.replace(asked, states=sane.states)
+        with pytest.raises(DirectorLost, match=f"tick 5 of 't'.*{words}"):
+            director.react(asked)
+
+
+@pytest.mark.parametrize("theirs", ["feed", ""])
+def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) -> None:
+    """Whatever it would do: both ends sign with their version, and each refuses the other's."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, echo, by=theirs)
+        with pytest.raises(DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"):
+            RemoteDirector(client, KEY, by="cafe").react(query())
+        lax = keys.director("test", "lax")
+        hub.serve(lax, lambda payload: signed(echo(opened(payload, EventQuery, "cafe")), theirs))
+        with pytest.raises(DirectorLost, match=f"'{theirs}' met behaviours 'cafe'"):
+            RemoteDirector(client, lax, by="cafe").react(query())
+
+
+def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
+    """Served on a key with wildcards it answers any concrete one, and still no wildcard query."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, keys.EVERY_DIRECTOR, echo)
+        for run, env in (("a", "x"), ("b", "y")):
+            assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
+        with pytest.raises(EngineError, match="ask for exactly"):
+            client.ask(keys.director("a", "x").replace("a", "*", 1), signed(query(), ""), timeout_s=PATIENCE_S)
+
+
+def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> None:
+    """Once, after two seconds; the director that comes then is taken."""
+    told: list[str] = []
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+
+        def waiting(words: str) -> None:
+            told.append(words)
+            serve_director(hub, KEY, echo)
+
+        assert RemoteDirector(client, KEY, wait_s=PATIENCE_S, waiting=waiting).react(query(3)).tick == 3
+    assert told == [f"waits at tick 3 for the director, {PATIENCE_S:g} s at most"]
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [b"", b"\xc1", b"\x80", b"\xdd\xff\xff\xff\xff", b"\x91" * 100_000, b"\x80\x04."],
+    ids=["empty", "unused byte", "map", "long array", "deep", "pickled"],
+)
+def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None:
+    """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, echo)
+        with pytest.raises(EngineError, match=r"not a (Signed|EventQuery) message"):
+            client.ask(KEY, payload, timeout_s=PATIENCE_S)
+        assert RemoteDirector(client, KEY).react(query(3)).tick == 3
+
+
+def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
+    """A query for every environment at once is refused: each director answers its own key."""
+    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+        serve_director(hub, KEY, echo)
+        with pytest.raises(EngineError, match=f"ask for exactly '{KEY}'"):
+            client.ask("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
+
+
+def test_nobody_to_connect_to_is_an_error_with_the_endpoint(tmp_path: Path) -> None:
+    """A client without a hub fails and names the endpoint."""
+    with pytest.raises(EngineError, match="no hub answers at unixsock-stream"):
+        Session.client(endpoint(tmp_path))
+
+
+def test_names_that_cannot_stand_in_a_key_are_refused() -> None:
+    """Slashes, wildcards and empty names are no chunk of a key; `chunk` makes any name fit."""
+    for bad in ("", "a/b", "*", "a b", "x" * 65):
+        with pytest.raises(SpecError, match="cannot name a run or environment"):
+            keys.director("run", bad)
+    assert keys.chunk("lh 011/00") == "lh-011-00"
+
+
+def test_messages_travel_by_field_name() -> None:
+    """A message reads back as it was written, and an unknown field of a newer writer is ignored."""
+    assert decode(encode(query(5)), EventQuery) == query(5)

@@ -1,0 +1,381 @@
+"""Injected pedestrians: refusals, the order of steps, a running `cosim run`, and its replay."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+
+from bridge.live import LARGEST_B, taken
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.injection import Ack, Injected, Injection
+from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
+from scenarios.execution.injected import MOST_GUESTS, Guests
+from tests.conftest import PATIENCE_S, Cosim
+
+TICK_MS = 50
+
+
+class Nobody:
+    """A director without events."""
+
+    def react(self, query: EventQuery) -> EventReply:
+        return EventReply(episode=query.episode, tick=query.tick, states=(), actors=())
+
+
+def guests(*script: Injected) -> Guests:
+    """Guests on a map that is the square of 100 m at the origin."""
+    return Guests(Nobody(), TICK_MS, lambda x, y: 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0, script)
+
+
+def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
+    return EventQuery(
+        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=robot_x_m, robot_y_m=90.0, robot_heading_rad=0.0,
+        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
+    )  # fmt: skip
+
+
+def anna(**fields: object) -> Injection:
+    known: dict[str, object] = {"id": "anna", "path": ((10.0, 10.0), (13.0, 10.0)), "speed_mps": 1.5, "stay_s": 1.0}
+    return Injection(**known | fields)  # type: ignore[arg-type]
+
+
+def test_a_guest_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
+    """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second later it is gone."""
+    one = guests()
+    for tick in range(3):
+        assert not one.react(query(tick)).actors
+    ack = one.offer(anna(doing="look"))
+    assert ack == Ack(id="anna", status="accepted", tick=3, time_s=0.15)
+    seen = {tick: one.react(query(tick)).actors for tick in range(3, 80)}
+    assert (seen[3][0].id, seen[3][0].x_m, seen[3][0].y_m) == ("ei-anna", 10.0, 10.0)
+    assert seen[23][0].x_m == pytest.approx(11.5) and seen[23][0].speed_mps == pytest.approx(1.5)
+    assert seen[43][0].x_m == pytest.approx(13.0) and seen[45][0].doing == "look"
+    gone = min(tick for tick, actors in seen.items() if not actors)
+    assert gone == pytest.approx(43 + 20, abs=1)
+    assert one.log == (Injected(tick=3, injection=anna(doing="look")),)
+
+
+def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
+    """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path ends only."""
+    one = guests(Injected(tick=0, injection=anna(doing="sit")))
+    shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
+    assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
+    assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {"sit"}
+
+
+@pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
+def test_a_guest_whose_end_the_robot_stands_on_stays_beside_it(off_m: tuple[float, float]) -> None:
+    """It comes within a metre, stays for its time, and is gone, instead of walking round the robot for ever."""
+    end = (90.0 + off_m[0], 90.0 + off_m[1])
+    one = guests(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
+    shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
+    assert len(shown) < 240
+    assert {(actor.speed_mps, actor.doing) for actor in shown[-38:]} == {(0.0, "stand")}
+    assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
+
+
+def test_the_log_alone_replays_the_guests() -> None:
+    """Two of them, injected at different ticks: a director that only has the log shows the same, tick by tick."""
+    live, shown = guests(), []
+    for tick in range(60):
+        if tick in (4, 20):
+            live.offer(anna(id=f"p{tick}"))
+        shown.append(live.react(query(tick)).actors)
+    again = guests(*live.log)
+    assert [again.react(query(tick)).actors for tick in range(60)] == shown
+    assert [entry.tick for entry in live.log] == [4, 20]
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (b'{"id":"a","path":[[10,10]],"speed_mps":9}', "speed_mps must be above 0 and at most 3"),
+        (b'{"id":"a","path":[[10,500]]}', "not on this map"),
+        (b'{"id":"a","path":[]}', "path"),
+        (b'{"id":"a b","path":[[1,1]]}', "id"),
+        (b'{"id":"a","path":[[1,1]],"sped_mps":1}', "`sped_mps`. Valid choices: id, path, speed_mps, heading_rad"),
+        (b'{"id":"a","path":[[1,1]],"stay_s":-1}', "stay_s must be 0"),
+        (b'{"id":"a","path":[[1,NaN]]}', "malformed"),
+        (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("nan")]]}), "no number"),
+        (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("inf")]]}), "no number"),
+        (b"\x93\x01", ""),
+        (b"[" * 60_000, ""),
+        (b"x" * (LARGEST_B + 1), f"at most {LARGEST_B}"),
+        (b"", ""),
+    ],
+    ids=["fast", "off the map", "no path", "no name", "misspelt", "negative stay", "nan", "packed nan", "packed inf",
+         "cut short", "deep", "large", "empty"],
+)  # fmt: skip
+def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
+    """Nothing of it reaches the simulation."""
+    one = guests()
+    ack = taken(message, one.offer)
+    assert ack.status == "refused" and ack.tick is None and reason in ack.reason
+    assert not one.react(query(0)).actors and one.log == ()
+
+
+def test_the_same_name_twice_is_refused() -> None:
+    """Also when the first one is gone: the log knows everybody by name."""
+    one = guests()
+    assert one.offer(anna()).status == "accepted"
+    assert "of this id" in one.offer(anna()).reason
+    for tick in range(120):
+        one.react(query(tick))
+    assert not one.react(query(120)).actors and one.offer(anna()).status == "refused"
+
+
+def test_a_flood_is_bounded() -> None:
+    """Of 100,000 messages so many are taken as may be there at once; the rest is told why not."""
+    one = guests()
+    acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
+    assert sum(ack.status == "accepted" for ack in acks) == MOST_GUESTS
+    assert "are here already" in acks[-1].reason
+    assert len(one.react(query(0)).actors) == MOST_GUESTS
+
+
+def test_those_who_enter_count_while_the_director_is_asked() -> None:
+    """An offer that comes in between finds the street as full as it is about to be."""
+    acks: list[Ack] = []
+
+    class Slow(Nobody):
+        def react(self, query: EventQuery) -> EventReply:
+            acks.append(one.offer(anna(id="late")))
+            return super().react(query)
+
+    one = Guests(Slow(), TICK_MS, lambda x, y: True)
+    assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_GUESTS))
+    assert len(one.react(query(0)).actors) == MOST_GUESTS
+    assert acks[0].status == "refused" and "are here already" in acks[0].reason
+
+
+def test_a_guest_does_not_walk_through_the_robot() -> None:
+    """With the robot on its path it goes round and arrives."""
+    one = guests()
+    one.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
+    gaps = []
+    for tick in range(400):
+        actor = one.react(query(tick)).actors[0]
+        gaps.append(max(abs(actor.x_m - 90.0) - 0.35, abs(actor.y_m - 90.0) - 0.275))
+    assert min(gaps) > 0.2 and actor.x_m == pytest.approx(99.0)
+
+
+SLOW = """
+import time
+from pathlib import Path
+from cosim.episode.ports import CameraSpec, Manifest
+from cosim.core.state import Command
+
+class Slow:
+    manifest = Manifest("slow", rate_hz=20.0, camera=CameraSpec(64, 64))
+    def reset(self, scenario_id, seed):
+        self.count = 0
+    def act(self, observation):
+        if Path("enough").exists():
+            return Command(1.5, 0.6)  # off the sidewalk: that ends the episode
+        time.sleep(0.05)
+        self.count += 1
+        return Command(0.3 if self.count // 40 % 2 else -0.3, 0.0)  # to and fro, for as long as it takes
+"""
+
+CONNECTED = f"""
+import json, sys, threading, zenoh
+PATIENCE_S = {PATIENCE_S}
+config = zenoh.Config()
+config.insert_json5("mode", '"client"')
+config.insert_json5("connect/endpoints", json.dumps([sys.argv[1]]))
+"""
+
+LISTENER = """
+ended, heard = threading.Event(), {}
+def hear(sample):
+    topic = str(sample.key_expr).split("/")[-1]
+    heard.setdefault(topic, []).append(json.loads(sample.payload.to_string()))
+    if topic == "events" and any(news.startswith("ended") for news in heard["events"][-1]):
+        ended.set()
+with zenoh.open(config) as session:
+    subscriber = session.declare_subscriber("cosim/**", hear)
+    print("listening", flush=True)
+    ended.wait(PATIENCE_S)
+print(json.dumps(heard))
+"""
+
+VANDAL = """
+below, (x, y) = sys.argv[2], json.loads(sys.argv[3])
+done = threading.Semaphore(0)
+acks = []
+with zenoh.open(config) as session:
+    def ask(key, payload=b""):
+        replies = session.get(key, payload=payload, timeout=PATIENCE_S)
+        return next(((r.ok or r.err).payload.to_bytes() for r in replies), b"")
+    def said(message, key=f"{below}/inject"):
+        return ask(key, message).decode(errors="replace")
+    bad = {
+        "10 MB": said(b'{"id":"' + b"x" * 10_000_000 + b'"}'),
+        "10 MB of nothing": said(bytes(10_000_000)),
+        "NaN": said(b'{"id":"a","path":[[1,NaN]]}'),
+        "outside": said(b'{"id":"a","path":[[1e6,0]]}'),
+        "too fast": said(json.dumps({"id": "a", "path": [[x, y]], "speed_mps": 30}).encode()),
+        "twice": said(json.dumps({"id": "bob", "path": [[x, y]]}).encode()),
+        "every run": said(b"{}", "cosim/*/env/*/inject"),
+        "wrong run": said(b"{}", "cosim/other/env/t-0/inject"),
+    }
+    many = 2000
+    for i in range(many):
+        message = json.dumps({"id": f"p{i}", "path": [[x, y]]})
+        took = zenoh.handlers.Callback(lambda r: acks.append(r.ok and r.ok.payload.to_string()), drop=done.release)
+        session.get(f"{below}/inject", took, payload=message, timeout=PATIENCE_S)
+    for _ in range(many):
+        done.acquire()
+    bad["flood"] = [json.loads(ack) for ack in acks if ack]
+    bad["log"] = json.loads(ask(f"{below}/log"))
+    bad["camera"] = ask(f"{below}/camera").hex()[:16]
+print(json.dumps(bad))
+"""
+
+
+class OnAir(NamedTuple):
+    """A run on the air in a folder. way: points on its sidewalk."""
+
+    run: subprocess.Popen[str]
+    folder: Path
+    at: str
+    way: list[tuple[float, float]]
+
+    def python(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, *arguments]
+        return subprocess.run(command, cwd=self.folder, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+
+    def record(self) -> dict[str, Any]:
+        """The record, when the episode has been told to end."""
+        (self.folder / "enough").touch()
+        assert self.run.wait(timeout=PATIENCE_S) == 0
+        return json.loads((self.folder / "run" / "episodes" / "t-0" / "record.json").read_bytes())
+
+
+def once(what: Callable[[], bool]) -> None:
+    """Wait until something is so: who asks a busy run may get no answer at first."""
+    deadline = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < deadline
+        time.sleep(0.3)
+
+
+@contextmanager
+def on_air(folder: Path) -> Iterator[OnAir]:
+    """`cosim run --live` of an episode that lasts until it is told to end."""
+    from scenarios.builders.long_horizon import build
+    from scenarios.execution.places import place
+
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
+    crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
+    short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=())
+    write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
+    (folder / "slow.py").write_text(SLOW)
+    at = f"unixsock-stream/{folder}/air.sock"
+    words = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "slow:Slow", "--camera", "bullet"]
+    with subprocess.Popen([*words, "--out", "run", "--live", at], cwd=folder, text=True) as run:
+        try:
+            yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
+        finally:
+            run.kill()
+
+
+@pytest.mark.engine
+def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path, cosim: Cosim) -> None:
+    """`cosim inject` beside `cosim run --live`; `cosim replay` comes to the same state hash, given the injection."""
+    with on_air(tmp_path) as air:
+        there = ("--connect", air.at, "--wait", str(PATIENCE_S))
+        message = json.dumps({"id": "anna", "path": [air.way[0], air.way[-1]], "doing": "stop"})
+        sent = cosim("inject", message, *there)
+        assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
+        again = cosim("inject", message, *there)
+        assert again.returncode == 2 and "of this id" in again.stderr
+        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9")
+        once(lambda: "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr and said.returncode == 2)
+
+        def in_the_log() -> list[str]:
+            told = cosim("listen", "events", *there, "--seconds", "0")
+            assert told.returncode == 0, told
+            return [one["injection"]["id"] for one in json.loads(told.stdout.splitlines()[0])["injections"]]
+
+        once(lambda: in_the_log() == ["anna"])
+        words = [sys.executable, "-m", "cosim", "listen", "robot", *there]
+        for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
+            with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
+                assert listener.stdout is not None
+                ticks = [json.loads(listener.stdout.readline()) for _ in range(4)]
+                if code == 130:
+                    listener.terminate()
+                    listener.wait()
+                listener.stdout.close()
+            assert listener.returncode == code and all("x_m" in tick for tick in ticks), ends
+        record = air.record()
+    assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
+    replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
+    assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
+    assert "replaying t-0 ..." in replayed.stderr
+    without = json.dumps(record | {"injections": []})
+    (tmp_path / "run" / "episodes" / "t-0" / "record.json").write_text(without)
+    differs = cosim("replay", "run", "t-0", cwd=tmp_path)
+    assert differs.returncode == 2 and "not the same" in differs.stderr
+
+
+@pytest.mark.engine
+def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, cosim: Cosim) -> None:
+    """The README's script injects, one who comes late hears all topics and gets the log, nonsense and floods bounce."""
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    found = re.search(r"```python\n(import json, zenoh\n.*?)```", readme, re.DOTALL)
+    assert found is not None
+    with on_air(tmp_path) as air:
+        script = found[1].replace("tcp/127.0.0.1:7447", air.at)
+        script = script.replace("[170, 252], [190, 252]", json.dumps([air.way[0], air.way[-1]])[1:-1])
+        (tmp_path / "ten.py").write_text(script)
+        assert cosim("listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0").returncode == 0
+        bob = json.loads(air.python("ten.py").stdout)
+        words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]
+        with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
+            assert listener.stdout is not None and listener.stdout.readline() == "listening\n"
+            vandal = air.python("-c", CONNECTED + VANDAL, air.at, "cosim/run/env/t-0", json.dumps(air.way[2]))
+            assert vandal.returncode == 0, vandal.stderr
+            record = air.record()
+            heard = json.loads(listener.stdout.read())
+    assert bob["status"] == "accepted" and bob["time_s"] == pytest.approx(0.05 * bob["tick"])
+    said = json.loads(vandal.stdout)
+    for name, words in {
+        "10 MB": f"at most {LARGEST_B}", "10 MB of nothing": f"at most {LARGEST_B}", "NaN": "malformed",
+        "outside": "not on this map", "too fast": "at most 3, not 30", "twice": "of this id",
+        "every run": "ask for exactly 'cosim/run/env/t-0/inject'",
+    }.items():  # fmt: skip
+        assert words in said[name], said[name]
+    assert said["wrong run"] == "" and said["camera"] == b"\x89PNG\r\n\x1a\n".hex()
+    taken_in = [one["injection"]["id"] for one in record["injections"]]
+    for ack in said["flood"]:
+        assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
+        assert ack["status"] == "accepted" or "are here already" in ack["reason"]
+    assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
+    assert len(taken_in) == len(set(taken_in)) >= MOST_GUESTS
+    assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
+    guests = [sum(one["id"].startswith("ei-") for one in crowd) for crowd in heard["crowd"]]
+    assert MOST_GUESTS // 2 < max(guests) <= MOST_GUESTS
+    assert (
+        set(heard) == {"clock", "robot", "crowd", "signals", "events"} and heard["events"][-1][-1] == "ended: failure"
+    )
+    assert heard["clock"][-1]["tick"] > bob["tick"]
+    assert any(one["id"] == "ei-bob" for crowd in heard["crowd"] for one in crowd)
+    assert record["status"] == "done"
+    replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
+    assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr

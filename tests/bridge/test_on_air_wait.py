@@ -1,0 +1,80 @@
+"""`cosim listen` and `cosim inject` beside a run whose episode is not on the air yet: real Zenoh, no simulator."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from bridge.live import serve_injections
+from bridge.session import Session
+from cosim.spec.injection import Ack
+from tests.conftest import PATIENCE_S, Cosim
+
+pytestmark = pytest.mark.engine
+
+PEDESTRIAN = json.dumps({"id": "anna", "path": [[1, 2], [3, 4]]})
+
+
+def started(*words: str) -> subprocess.Popen[str]:
+    """A command of `cosim` that has said on standard error that it waits."""
+    command = subprocess.Popen(
+        [sys.executable, "-m", "cosim", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert command.stderr is not None
+    assert "waiting" in command.stderr.readline()
+    return command
+
+
+def put_on_the_air(hub: Session, name: str) -> None:
+    """Answer as an episode of a run does."""
+    serve_injections(
+        hub, f"cosim/r/env/{name}/inject", lambda one: Ack(id=one.id, status="accepted", tick=3, time_s=0.15)
+    )
+    hub.serve(f"cosim/r/env/{name}/log", lambda _: b'{"tick":7}')
+    hub.serve(f"cosim/r/env/{name}/status", lambda _: b"{}", found=True)
+
+
+def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
+    """Started before the run it says that it waits, then which episode came, and tells what that one tells."""
+    at = f"unixsock-stream/{tmp_path}/air.sock"
+    words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
+    with started(*words) as listening, Session.hub(at) as hub:
+        put_on_the_air(hub, "t-0")
+        out, err = listening.communicate()
+    assert listening.returncode == 0 and out == '{"tick":7}\n'
+    assert "r/t-0 is on the air" in err
+
+
+def test_inject_waits_for_the_episode_that_is_named(tmp_path: Path) -> None:
+    """Another episode of the same run does not do."""
+    at = f"unixsock-stream/{tmp_path}/air.sock"
+    with Session.hub(at) as hub:
+        put_on_the_air(hub, "t-0")
+        words = ("inject", PEDESTRIAN, "--connect", at, "--env", "r/t-1", "--wait", str(PATIENCE_S))
+        with started(*words) as injecting:
+            put_on_the_air(hub, "t-1")
+            out, err = injecting.communicate()
+    assert injecting.returncode == 0 and "'anna' enters at tick 3" in out
+    assert "r/t-1 is on the air" in err
+
+
+def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(tmp_path: Path, cosim: Cosim) -> None:
+    """No run, a run without an episode, another episode: each is told apart, with the remedy."""
+    at = f"unixsock-stream/{tmp_path}/air.sock"
+    refused = cosim("listen", "--connect", at)
+    assert refused.returncode == 3 and f"no run is on the air at {at}: start one with" in refused.stderr
+    assert f"--live {at}`" in refused.stderr and "--wait 60 waits" in refused.stderr
+    waited = cosim("inject", PEDESTRIAN, "--connect", at, "--wait", "0.1")
+    assert (
+        waited.returncode == 3 and f"no run is on the air at {at}" in waited.stderr and "waited 0.1 s" in waited.stderr
+    )
+    with Session.hub(at) as hub:
+        early = cosim("listen", "--connect", at)
+        assert early.returncode == 3 and "none of its episodes" in early.stderr and "--wait 60 waits" in early.stderr
+        put_on_the_air(hub, "t-0")
+        other = cosim("listen", "--connect", at, "--env", "r/t-9", "--wait", "0.1")
+        assert other.returncode == 2 and "unknown running episode 'r/t-9'. Valid choices: r/t-0." in other.stderr

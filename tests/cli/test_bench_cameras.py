@@ -1,0 +1,45 @@
+"""`cosim bench camera` where a camera cannot draw: real processes, real EGL without a vendor."""
+
+from __future__ import annotations
+
+import importlib
+import os
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from scenarios.bench import cameras as bench_cameras
+from scenarios.bench.cameras import Figure, measure, whole_frame
+from tests.conftest import Cosim
+
+pytestmark = pytest.mark.engine
+
+
+def test_what_cannot_be_drawn_is_told_with_its_reason(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
+) -> None:
+    """No OpenGL, a package that is missing, a process that dies: each figure has its words; others are taken."""
+    monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))
+    figures = (
+        Figure("by gl", partial(whole_frame, "gl", 3, 2), 200.0),
+        Figure("by a package", partial(importlib.import_module, "nowhere"), ""),  # type: ignore[arg-type]
+        Figure("by who dies", os._exit, 3),
+        Figure("by gl again", partial(whole_frame, "gl", 3, 2), 200.0),
+        Figure("by bullet", partial(whole_frame, "bullet", 3, 2), 200.0),
+    )
+    found = measure(2, lambda _: None, figures)
+    assert [len(found[figure.name].fps) for figure in figures] == [0, 0, 0, 0, 2]
+    assert "apt-get install libegl1" in found["by gl"].why and "OpenGL 4.3" in found["by gl"].why
+    assert found["by a package"].why == "ModuleNotFoundError: No module named 'nowhere'"
+    assert "process" in found["by who dies"].why and "exit code 3" in found["by who dies"].why
+    assert found["by bullet"].why == ""
+    monkeypatch.setattr(bench_cameras, "FIGURES", figures)
+    monkeypatch.setattr(bench_cameras, "RATIOS", (("gl / bullet", "by gl", "by bullet", ">= 5"),))
+    monkeypatch.setattr(bench_cameras, "measure", lambda *_: found)
+    said = cosim("bench", "camera", "--rounds", "2")
+    assert said.returncode == 0, said.stderr
+    told = " ".join(said.stdout.split())
+    assert "by a package cannot be drawn here: ModuleNotFoundError: No module named 'nowhere'" in told
+    assert "by gl; by gl again cannot be drawn here: the gl camera" in told and told.count("apt-get") == 1
+    assert "`cosim doctor`" in told and "see below" in told

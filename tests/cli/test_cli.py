@@ -1,0 +1,393 @@
+"""The command line as a user runs it: real engines, real processes, real signals."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import SimpleNamespace
+
+import msgspec
+import pandas as pd
+import pytest
+
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from tests.conftest import PATIENCE_S, WIDE, Cosim
+
+pytestmark = pytest.mark.engine
+
+POLICIES = """
+import os, signal, time
+from pathlib import Path
+import numpy as np
+from cosim.episode.ports import Manifest
+from cosim.core.state import Command
+
+class Base:
+    manifest = Manifest("base", camera=None)
+    def reset(self, scenario_id, seed):
+        self.scenario, self.count = scenario_id, 0
+    def act(self, observation):
+        self.count += 1
+        return Command(1.0, 0.0)
+
+class Held(Base):
+    # waits before a scenario while there is a file hold-SCENARIO
+    def reset(self, scenario_id, seed):
+        super().reset(scenario_id, seed)
+        hold = Path(f"hold-{scenario_id}")
+        if hold.exists():
+            hold.with_name("waits").touch()
+        while hold.exists():
+            time.sleep(0.02)
+class DiesLate(Base):
+    # takes its process down right after the record of t-1 is on the disk
+    def act(self, observation):
+        from cosim.records.record import Record
+        save = Record.save
+        def dying(record, path):
+            save(record, path)
+            if record.scenario == "t-1": os.kill(os.getpid(), signal.SIGKILL)
+        if self.count == 0: Record.save = dying
+        self.count += 1
+        return Command(1.0, 0.0)
+class DiskFull(Base):
+    # the disk is full when the trajectory of t-1 is written
+    def act(self, observation):
+        from cosim.records.record import Log
+        save = Log.save
+        def failing(log, path):
+            if path.parent.name == "t-1": raise OSError(28, "No space left on device")
+            save(log, path)
+        if self.count == 0: Log.save = failing
+        self.count += 1
+        return Command(1.0, 0.0)
+class Unfinished: pass
+"""
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A user's folder: a suite of three short scenarios, one of four, and a module with policies."""
+    from scenarios.builders.long_horizon import build
+    from scenarios.execution.places import place
+
+    folder = tmp_path_factory.mktemp("desk")
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    graph = WalkGraph(street_map)
+    scenarios = []
+    for i in range(4):
+        whole = build(city, street_map, graph, i, f"t-{i}")
+        fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
+        crowd = CrowdSpec(persons=8, radius_m=50.0, vehicles=2)
+        scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 2.0}))
+    for name, count in (("tiny", 3), ("four", 4)):
+        write_suite(Suite(name=name, version="1", scenarios=tuple(scenarios[:count])), folder / f"{name}.json")
+    (folder / "mine.py").write_text(POLICIES)
+    return folder
+
+
+def rows(folder: Path) -> pd.DataFrame:
+    return pd.read_csv(folder / "results.csv", index_col="scenario")
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {p.parent.name: json.loads(p.read_text())["state_hash"] for p in folder.glob("episodes/*/record.json")}
+
+
+def wait_for(condition: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < deadline, "nothing happened in time"
+        time.sleep(0.02)
+
+
+@contextmanager
+def running(desk: Path, *words: str) -> Iterator[subprocess.Popen[str]]:
+    """A run that is going on, and is killed in the end."""
+    command = [sys.executable, "-m", "cosim", "run", *words]
+    run = subprocess.Popen(
+        command, cwd=desk, env=os.environ | WIDE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+        preexec_fn=hear_interrupts,
+    )  # fmt: skip
+    try:
+        yield run
+    finally:
+        run.kill()
+        run.communicate()
+
+
+@contextmanager
+def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
+    """Policy Held waits before this scenario. Gives whether it does so already."""
+    hold, waits = desk / f"hold-{scenario}", desk / "waits"
+    hold.touch()
+    try:
+        yield waits.exists
+    finally:
+        hold.unlink()
+        waits.unlink(missing_ok=True)
+
+
+@pytest.fixture(scope="module")
+def whole_run(desk: Path, fresh_cosim: Cosim) -> Path:
+    """The tiny suite, run without interruption by one process, the camera on."""
+    done = fresh_cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", "whole", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    return desk / "whole"
+
+
+HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--out")
+
+
+@pytest.fixture(scope="module")
+def unbroken(desk: Path, fresh_cosim: Cosim) -> bytes:
+    """The table of a run of two episodes that nothing has interrupted."""
+    done = fresh_cosim("run", *HELD, "unbroken", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    return (desk / "unbroken/results.csv").read_bytes()
+
+
+def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+    """Rows, records, trajectories and specs are there, and `show` prints the same table again."""
+    table = rows(whole_run)
+    assert list(table.index) == ["t-0", "t-1", "t-2"]
+    assert set(table["status"]) == {"done"}
+    assert set(table["renderer"]) == {json.loads((whole_run / "run.json").read_text())["renderer"]}
+    for name in table.index:
+        assert (whole_run / "episodes" / name / "trajectory.npz").exists()
+    shown = cosim("show", "whole", cwd=desk)
+    assert shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, finished 3, crashed 0" in shown.stdout
+    one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
+    assert one.returncode == 0, one.stderr
+    assert (desk / "above.png").stat().st_size > 5000
+
+
+def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+    """State hashes and rows are identical for one process and for two."""
+    words = ("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--jobs", "2", "--out", "two")
+    two = cosim(*words, cwd=desk)
+    assert two.returncode == 0
+    assert "\n3 episodes, " in two.stderr and "episodes of 'straight' on this machine" in two.stderr
+    assert ": done, 3 of 3\n" in two.stderr
+    assert hashes(desk / "two") == hashes(whole_run)
+    assert all(len(h) == 32 for h in hashes(whole_run).values())
+    assert len(set(hashes(whole_run).values())) == 3
+    assert (desk / "two/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda how: how.name)
+def test_an_interrupted_run_is_finished_by_resume(
+    desk: Path, cosim: Cosim, unbroken: bytes, how: signal.Signals
+) -> None:
+    """Killed or stopped in the middle, then resumed: no episode is run twice or lost, and the table is the same."""
+    out = desk / f"broken-{how.name}"
+    with held_before(desk, "t-1") as waits, running(desk, *HELD, out.name) as run:
+        wait_for(waits)
+        run.send_signal(how)
+        said = run.communicate(timeout=PATIENCE_S)[1]
+        if how != signal.SIGKILL:
+            assert run.returncode == 130
+            assert f"--out {out.name} --resume" in said and "1 of 2 episodes are finished and kept" in said
+        kept = (out / "episodes/t-0/record.json").stat().st_mtime_ns
+        wait_for(lambda: not alive(out))
+    if how == signal.SIGTERM:
+        return  # it was stopped as by Ctrl-C
+    again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
+    assert again.returncode == 0, again.stderr
+    assert (out / "episodes/t-0/record.json").stat().st_mtime_ns == kept
+    assert (out / "results.csv").read_bytes() == unbroken
+
+
+@pytest.mark.parametrize("when", ["its process starts", "its first episode starts"])
+def test_a_run_killed_at_its_start_leaves_no_false_crash(desk: Path, cosim: Cosim, unbroken: bytes, when: str) -> None:
+    """A kill while the first environment process comes up loses nothing, and resuming gives the same table."""
+    out = desk / when.replace(" ", "-")
+    with held_before(desk, "t-0") as waits, running(desk, *HELD, out.name) as run:
+        wait_for(lambda: children(run.pid))
+        left = children(run.pid)
+        if when == "its first episode starts":
+            wait_for(waits)
+        run.kill()
+        wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in left))
+    assert not list(out.glob("episodes/*/record.json"))
+    again = cosim("run", *HELD, out.name, "--resume", cwd=desk)
+    assert again.returncode == 0, again.stderr
+    assert (out / "results.csv").read_bytes() == unbroken
+
+
+def hear_interrupts() -> None:
+    """A shell's background jobs are started deaf to Ctrl-C; a user's run is not one."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+def children(pid: int) -> list[int]:
+    """Environment processes of a run."""
+    task = Path(f"/proc/{pid}/task/{pid}/children")
+    pids = [int(word) for word in task.read_text().split()] if task.exists() else []
+    lines = {p: Path(f"/proc/{p}/cmdline") for p in pids}
+    return [p for p, line in lines.items() if line.exists() and b"scenarios.execution.shepherd" in line.read_bytes()]
+
+
+def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: Cosim) -> None:
+    """A process that dies after writing its record has finished the episode: it is neither run again nor crashed."""
+    out = desk / "late"
+    run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--out", out.name, cwd=desk)
+    assert run.returncode == 0, run.stdout
+    assert list(rows(out)["status"]) == ["done", "done", "done"]
+
+
+def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim) -> None:
+    """When a record cannot be written the run stops, says why, and keeps what is finished."""
+    out = desk / "full"
+    run = cosim("run", "tiny.json", "--policy", "mine:DiskFull", "--out", out.name, cwd=desk)
+    assert run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
+    assert "Traceback" not in run.stderr
+    assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"
+
+
+def alive(out: Path) -> bool:
+    """Whether an environment process still writes to the logs of a run."""
+    logs = {str(p.resolve()) for p in out.glob("logs/*")}
+    for fd in Path("/proc").glob("[0-9]*/fd/1"):
+        try:
+            if str(fd.readlink()) in logs:
+                return True
+        except OSError:
+            continue
+    return False
+
+
+def test_a_second_run_on_the_same_folder_is_refused(desk: Path, cosim: Cosim) -> None:
+    """While a run is going on its folder is locked, and afterwards it is not overwritten."""
+    with held_before(desk, "t-0") as waits, running(desk, *HELD, "held") as run:
+        wait_for(waits)
+        second = cosim("run", *HELD, "held", "--resume", cwd=desk)
+        assert second.returncode == 2
+        assert f"in use by process {run.pid}" in second.stderr
+        third = cosim("run", *HELD, "held", cwd=desk)
+        assert third.returncode == 2 and "already holds a run. Add --resume" in third.stderr
+
+
+def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+    """Unknown suites, policies, scenarios, runs and episodes: exit 2, the name, and the valid choices."""
+    asked = {
+        ("run", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
+        ("run", "tiny.json", "--policy", "rout"): ("policy 'rout'", "route, social_force, stop, straight"),
+        ("run", "tiny.json", "--policy", "mine:Hel"): ("'Hel'", "Held"),
+        ("run", "tiny.json", "--policy", "nowhere:X"): ("module 'nowhere' cannot be imported", "ModuleNotFoundError"),
+        ("run", "tiny.json", "--policy", "mine:Unfinished"): ("'mine:Unfinished' has no attribute 'manifest'", ""),
+        ("run", "tiny.json", "--scenario", "t-9"): ("scenario 't-9'", "t-0, t-1, t-2"),
+        ("run", "tiny.json", "--resume"): ("--resume needs --out", ""),
+        ("show", "whole", "--episode", "t-9"): ("'t-9'", "t-0, t-1, t-2"),
+        ("show", "nothing"): ("run 'nothing'", "whole"),
+        ("list", "short-horizon"): ("suite 'short-horizon'", "long-horizon"),
+    }
+    for words, (name, choices) in asked.items():
+        said = cosim(*words, cwd=desk)
+        assert said.returncode == 2, (words, said.stderr)
+        assert name in said.stderr and choices in said.stderr, (words, said.stderr)
+        assert "Traceback" not in said.stderr
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"route": [[0, 0]]}, "route needs two points"),
+        ({"goal": [1.0, 2.0]}, "is not the route's end"),
+        ({"time_limit_s": "long"}, "Expected `float`, got `str` - at `$.scenarios[0].time_limit_s`"),
+        ({"crowd": {"persons": -1}}, "crowd persons must be in [0, 1000], not -1"),
+        ({"schema": 99}, "has schema 99"),
+        (
+            {"crowd": {"gruops": 0.4}},
+            "unknown field `gruops` - at `$.scenarios[0].crowd`. Valid choices: persons, radius",
+        ),
+        ({"ends_at": "noon"}, "Invalid enum value 'noon' - at `$.scenarios[0].ends_at`. Valid choices: goal, stop"),
+        ({"id": "../../elsewhere"}, "scenario id '../../elsewhere' cannot name a folder"),
+    ],
+)
+def test_a_broken_suite_file_is_named_with_its_field(
+    desk: Path, cosim: Cosim, change: dict[str, object], message: str
+) -> None:
+    """A scenario file that contradicts itself is refused before anything runs."""
+    suite = json.loads((desk / "tiny.json").read_text())
+    suite["scenarios"][0] |= change
+    (desk / "bad.json").write_text(json.dumps(suite))
+    said = cosim("run", "bad.json", "--out", "bad", cwd=desk)
+    assert said.returncode == 2 and "bad.json" in said.stderr and message in said.stderr
+    assert not (desk / "bad").exists()
+
+
+def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
+    """Nothing to run is an error that names the file, not a run of nothing that went well."""
+    suite = json.loads((desk / "tiny.json").read_text())
+    (desk / "empty.json").write_text(json.dumps(suite | {"scenarios": []}))
+    said = cosim("run", "empty.json", "--out", "empty", cwd=desk)
+    assert said.returncode == 2 and "empty.json: suite 'tiny' has no scenarios" in said.stderr
+
+
+def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
+    """A wrong endpoint is told with the remedy, and the same command with a right one is not refused."""
+    said = cosim("run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--out", "air", cwd=desk)
+    assert said.returncode == 3 and not (desk / "air").exists()
+    assert "cannot listen at tcp/192.0.2.1:7447" in said.stderr and "Choose an address of this" in said.stderr
+    heard = cosim("listen", "--connect", "7447", cwd=desk)
+    assert heard.returncode == 2 and "--connect '7447': write it as PROTOCOL/ADDRESS:PORT" in heard.stderr
+
+
+def test_ctrl_c_while_the_modules_load_is_no_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stopped before any command has begun: exit code 130."""
+    from cosim.__main__ import main
+
+    def stopped() -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setitem(sys.modules, "cosim.cli.app", SimpleNamespace(main=stopped))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 130
+
+
+def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim) -> None:
+    """A start off the sidewalk, another street net, a robot and a map that nobody knows: told together, before anything
+    runs, and no folder is left."""
+    suite = json.loads((desk / "four.json").read_text())
+    off, other, robot, unknown = suite["scenarios"]
+    off["start"][:2] = off["route"][0] = [-50.0, -50.0]
+    other["place"]["net_hash"] = "0" * 16
+    robot["robot"] = "tank"
+    unknown["place"] = {"kind": "map", "map": "atlantis"}
+    (desk / "odd.json").write_text(json.dumps(suite))
+    said = cosim("run", "odd.json", "--policy", "stop", "--out", "odd", cwd=desk)
+    assert said.returncode == 2 and not (desk / "odd").exists()
+    head, *faults = said.stderr[said.stderr.index("error: ") :].splitlines()
+    assert head == "error: suite 'four': 5 faults:" and len(faults) == 5
+    for words in (
+        "scenario 't-0': start is off the walkable area at (-50.00, -50.00)", "scenario 't-0': crossing ",
+        "scenario 't-1': ", "the net's hash is ", "scenario 't-2': unknown robot 'tank'. Valid choices: courier",
+        "scenario 't-3': unknown map 'atlantis'",
+    ):  # fmt: skip
+        assert sum(words in fault for fault in faults) == 1, (words, faults)
+
+
+def test_the_doctor_finds_every_engine_well(desk: Path, fresh_cosim: Cosim) -> None:
+    """`cosim doctor` draws a frame, walks people, asks a director, and says so."""
+    said = fresh_cosim("doctor", cwd=desk)
+    assert said.returncode == 0, said.stdout
+    assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
+
+
+def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:
+    """Suite and scenario hash, seed, policy, renderer and the version of every engine are in each record."""
+    record = msgspec.json.decode((whole_run / "episodes/t-0/record.json").read_bytes())
+    assert {"libsumo", "pybullet", "eclipse-zenoh", "numpy"} <= set(record["versions"])
+    for field in ("suite_hash", "scenario_hash", "seed", "policy", "policy_version", "renderer", "state_hash"):
+        assert record[field] not in ("", None)

@@ -1,0 +1,133 @@
+"""What the command line says of itself: help with examples, versions; no engine is started for it."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from importlib.metadata import version
+from typing import Any
+
+import pytest
+from typer.main import get_command
+from typer.testing import CliRunner
+
+from cosim.cli.app import app
+from cosim.cli.live import checked_endpoint
+from cosim.core.errors import UsageError
+from tests.conftest import PATIENCE_S
+
+FIRST = ("run", "list", "show", "doctor")
+
+
+def commands(group: Any, words: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command below a group, with the words that call it."""
+    for name, command in getattr(group, "commands", {}).items():
+        if hasattr(command, "commands"):
+            yield from commands(command, (*words, name))
+        else:
+            yield (*words, name), command
+
+
+COMMANDS = dict(commands(get_command(app)))
+
+
+def said(*words: str) -> str:
+    """What `cosim WORDS` prints in a terminal of 80 columns."""
+    result = CliRunner().invoke(app, list(words), terminal_width=80, color=False, env={"COLUMNS": "80"})
+    assert result.exit_code == 0, result.output
+    return result.output
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_has_an_example_of_itself(words: tuple[str, ...]) -> None:
+    """The help ends with an example that begins with the command, and each example's options exist."""
+    epilog = COMMANDS[words].epilog or ""
+    examples = re.findall(r"`(cosim [^`]+)`", epilog)
+    own = [example for example in examples if example.startswith(" ".join(("cosim", *words)))]
+    assert own, f"no example in the help of {' '.join(words)}"
+    options = {option for parameter in COMMANDS[words].params for option in parameter.opts}
+    for example in own:
+        assert set(re.findall(r"(?<!\S)--?[a-z][a-z-]*", example)) <= options, example
+
+
+@pytest.mark.parametrize("words", [(), ("city",), ("map",), *COMMANDS], ids=" ".join)
+def test_help_is_read_in_80_columns(words: tuple[str, ...]) -> None:
+    """No line is longer, nothing is cut, and no list of choices is broken in the middle of a word."""
+    lines = said(*words, "--help").splitlines()
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    assert not re.findall(r"<[a-z|-]*[|][a-z|-]*(?![a-z|>-])", "\n".join(lines))
+
+
+def test_h_is_help() -> None:
+    """Whoever types -h is helped, everywhere."""
+    assert said("-h") == said("--help") and said("map", "check", "-h") == said("map", "check", "--help")
+
+
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_maps_in_examples_are_there_or_imported_by_them(words: tuple[str, ...]) -> None:
+    """Nobody who types an example is told that its map is unknown: it comes with SUMO, or an example imports it."""
+    named = re.findall(r"(?:--map|map check|map endure) ([a-z][\w-]*)", COMMANDS[words].epilog or "")
+    imported = re.findall(r"map import ([\w-]+)[.]", COMMANDS["map", "import"].epilog)
+    assert all(name.startswith("sumo-") or name in imported for name in named), named
+
+
+def test_what_a_newcomer_needs_comes_first() -> None:
+    """`cosim --help` begins with the commands of the README's first section."""
+    shown = said("--help")
+    places = [shown.index(f"│ {name} ") for name in FIRST]
+    assert places == sorted(places)
+    others = {words[0] for words in COMMANDS} - set(FIRST)
+    assert all(shown.index(f"│ {name} ") > places[-1] for name in others)
+
+
+def test_the_version_is_said_without_an_engine() -> None:
+    """`cosim --version` names the project, Python and the engines; it imports no engine and no pandas."""
+    code = (
+        "import sys\n"
+        "from typer.testing import CliRunner\n"
+        "from cosim.cli.app import app\n"
+        "print(CliRunner().invoke(app, ['--version']).output)\n"
+        "slow = {'libsumo', 'pybullet', 'zenoh', 'moderngl', 'pandas', 'scipy', 'shapely', 'cv2'}\n"
+        "print(sorted(slow & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
+    assert done.returncode == 0, done.stderr
+    *lines, imported = done.stdout.strip().splitlines()
+    assert imported == "[]"
+    text = "\n".join(lines)
+    assert f"cosim {version('sidewalk-cosim')}" in text and f"Python {sys.version.split()[0]}" in text
+    for name, package in (("SUMO", "libsumo"), ("PyBullet", "pybullet"), ("Zenoh", "eclipse-zenoh")):
+        assert f"{name} {version(package)}" in text
+
+
+def test_the_version_of_an_engine_that_is_not_installed_is_said_to_be_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`cosim --version` is for a broken machine too."""
+    from importlib.metadata import PackageNotFoundError
+
+    from cosim.core import versions
+
+    def without(package: str) -> str:
+        if package == "pybullet":
+            raise PackageNotFoundError(package)
+        return "1.2"
+
+    monkeypatch.setattr(versions, "version", without)
+    assert "PyBullet missing" in said("--version") and "SUMO 1.2" in said("--version")
+
+
+@pytest.mark.parametrize(
+    "endpoint", ["7447", "tcp/", "tcp/127.0.0.1", "tcp/127.0.0.1:99999", "tcp/127.0.0.1:0", "tcp/:x", "ftp/a:1"]
+)
+def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) -> None:
+    """Before anything is tried: a protocol, an address, a port from 1 to 65535."""
+    with pytest.raises(UsageError, match=r"like tcp/127\.0\.0\.1:7447"):
+        checked_endpoint(endpoint, "--connect")
+
+
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "udp/host:65535", "unixsock-stream//tmp/a"])
+def test_an_endpoint_that_may_be_one_is_taken(endpoint: str) -> None:
+    """Names, addresses of both kinds, sockets in the file system."""
+    assert checked_endpoint(endpoint, "--connect") == endpoint

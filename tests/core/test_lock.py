@@ -1,0 +1,69 @@
+"""The lock files: the same versions for everybody, because the same versions give the same bits."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from cosim.core.versions import PACKAGES, versions
+
+ROOT = Path(__file__).parents[2]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+
+def locked(name: str) -> dict[str, str]:
+    """Version of each package of a lock file."""
+    return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
+
+
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"], ids=["run", "dev"])
+def test_every_locked_package_has_hashes_and_no_home(name: str) -> None:
+    """A lock file names packages, versions and hashes alone: no host, no folder, no version of somebody's own."""
+    text = re.sub(r"^#.*\n", "", (ROOT / name).read_text(), flags=re.MULTILINE)
+    entry = r"[a-z0-9-]+==[0-9][0-9a-z.]* \\\n(    --hash=sha256:[0-9a-f]{64} \\\n)*    --hash=sha256:[0-9a-f]{64}\n"
+    assert re.fullmatch(f"({entry})+", text)
+
+
+def test_the_lock_files_hold_what_the_project_asks_for() -> None:
+    """Every requirement is locked within its range, what builds the project too; tests and runs agree."""
+    run, dev = locked("requirements.lock"), locked("requirements-dev.lock")
+    assert run.items() <= dev.items()
+    project, groups = PROJECT["project"], PROJECT["dependency-groups"]
+    for line in (*project["dependencies"], *groups["build"], *PROJECT["build-system"]["requires"]):
+        asked = Requirement(line)
+        assert asked.specifier.contains(run[canonicalize_name(asked.name)]), line
+    for line in project["optional-dependencies"]["dev"]:
+        asked = Requirement(line)
+        assert asked.specifier.contains(dev[canonicalize_name(asked.name)]), line
+
+
+def test_what_is_installed_here_is_what_is_locked() -> None:
+    """The tests run with the locked versions."""
+    found: dict[str, str] = {}
+    for name in locked("requirements-dev.lock"):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "not installed"
+    assert found == locked("requirements-dev.lock"), "set up again: make test"
+
+
+def test_everything_is_installed_from_the_lock_files() -> None:
+    """Each `pip install` of the set-up takes hashes, or nothing but the project itself; CI and container use both."""
+    for name in ("Makefile", "Containerfile", ".ci/run"):
+        for line in (ROOT / name).read_text().splitlines():
+            if re.search(r"(pip|PIP\)) install", line) and "install --quiet uv" not in line:
+                assert "--require-hashes" in line or "--no-deps --no-build-isolation" in line, f"{name}: {line}"
+
+
+def test_whatever_can_change_bits_or_pictures_is_in_the_record() -> None:
+    """Engines, numerics, the libraries inside them and what draws are recorded with their versions."""
+    assert set(PACKAGES) - {"sidewalk-cosim"} <= set(locked("requirements.lock"))
+    assert {"libsumo", "pybullet", "osmium", "moderngl", "glcontext", "opencv-python-headless"} < set(versions())
+    assert re.fullmatch(r"3\.\d+\.\d+", versions()["geos"]) and re.fullmatch(r"2\.\d+", versions()["glibc"])

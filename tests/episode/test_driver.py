@@ -1,0 +1,222 @@
+"""A policy at arm's length: what it is given, what it may answer, what it may raise."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import signal
+from collections.abc import Callable
+from typing import NoReturn
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from cosim.core.errors import PolicyError
+from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
+from cosim.episode.driver import Doing, Driver
+from cosim.episode.ports import Manifest, Observation, Privileged
+
+MINE = Manifest("mine", camera=None)
+
+
+class Fake:
+    """Acts as it is told."""
+
+    def __init__(self, act: Callable[[Observation], object], manifest: Manifest = MINE) -> None:
+        self.manifest = manifest
+        self.does = act
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        if scenario_id == "bad":
+            raise SystemExit(3)
+
+    def act(self, observation: Observation) -> Command:
+        return self.does(observation)  # type: ignore[return-value]
+
+
+def seen(tick: int = 0, known: Privileged | None = None) -> Observation:
+    return Observation(tick, 0.05 * tick, np.full((4, 4, 3), 7, np.uint8), 0.5, 0.0, known)
+
+
+def knowledge() -> Privileged:
+    people = People.of(("c1",), [[1.0, 2.0]], [0.0], [1.0], ("walk",))
+    vehicles = Vehicles.of(("v1",), [[5.0, 5.0]], [0.0], [8.0], [[4.0, 2.0]])
+    robot, route = RobotState(Pose(0.0, 0.0, 0.0), 1.0), Polyline([(0, 0), (9, 0)])
+    return Privileged(
+        robot, route, 0.0, people, vehicles, {"x": Signal(False, 3.0)}, (("x", 1.0, 2.0),), box(0, 0, 9, 9)
+    )
+
+
+def raising(error: BaseException) -> Callable[[Observation], NoReturn]:
+    def act(_: Observation) -> NoReturn:
+        raise error
+
+    return act
+
+
+class Mute(Exception):
+    """An error whose message cannot be read."""
+
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+@pytest.fixture
+def deaf() -> object:
+    """Ctrl-C is ignored, as in an environment process."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (KeyError("no such weight"), "raised KeyError: 'no such weight' (act at 0.10 s)"),
+        (SystemExit(3), "raised SystemExit: 3 (act at 0.10 s)"),
+        (KeyboardInterrupt(), "raised KeyboardInterrupt (act at 0.10 s)"),
+        (GeneratorExit(), "raised GeneratorExit (act at 0.10 s)"),
+        (MemoryError(), "raised MemoryError (act at 0.10 s)"),
+        (Mute(), "raised Mute: (its message cannot be read)"),
+        (ValueError("\ud800\x1b[2J"), "raised ValueError: ??[2J"),
+        (ValueError("x" * 10_000), "... (10000 characters)"),
+    ],
+    ids=["error", "exit", "ctrl-c", "generator", "memory", "mute", "odd-text", "long-text"],
+)
+def test_whatever_a_policy_raises_is_its_crash(deaf: None, error: BaseException, told: str) -> None:
+    """Also what is no Exception, and what cannot be written down: one message with the policy's name and the time."""
+    with pytest.raises(PolicyError) as caught:
+        Driver(Fake(raising(error))).act(seen(tick=2))
+    assert str(caught.value).startswith("policy 'mine' raised ") and told in str(caught.value)
+    str(caught.value).encode()
+
+
+def test_a_reset_that_raises_is_a_crash_too() -> None:
+    """It is told as what happened in reset."""
+    with pytest.raises(PolicyError, match=r"policy 'mine' raised SystemExit: 3 \(reset\)"):
+        Driver(Fake(lambda _: STILL)).reset("bad", 0)
+
+
+def test_ctrl_c_is_no_crash() -> None:
+    """Where somebody can press it, it ends what is going on."""
+    with pytest.raises(KeyboardInterrupt):
+        Driver(Fake(raising(KeyboardInterrupt()))).act(seen())
+
+
+def test_an_answer_is_read_once_and_inside_the_door() -> None:
+    """Numbers that raise when they are read, or change each time, cannot leave the robot's limits."""
+
+    class Pretends(float):
+        def __float__(self) -> float:
+            raise SystemExit(9)
+
+    class Shifty(Command):
+        @property
+        def v_mps(self) -> float:  # type: ignore[override]
+            return next(values)
+
+    with pytest.raises(PolicyError, match="raised SystemExit: 9"):
+        Driver(Fake(lambda _: Command(Pretends(1.0), 0.0))).act(seen())
+    values = iter([1.0, float("nan"), 99.0])
+    shifty = object.__new__(Shifty)
+    object.__setattr__(shifty, "w_radps", 0.0)
+    assert Driver(Fake(lambda _: shifty)).act(seen()) == Command(1.0, 0.0)
+
+
+def test_what_a_policy_writes_into_nobody_sees() -> None:
+    """Pictures, arrays, states and signals that it is given are copies."""
+
+    def scribbles(observation: Observation) -> Command:
+        observation.rgb[:] = 0  # type: ignore[index]
+        known = observation.privileged
+        assert known is not None
+        people, vehicles = known.people, known.vehicles
+        for array in (people.xy, people.heading, people.speed, people.strides, people.pace, known.route.points,
+                      known.route.s_m, vehicles.xy, vehicles.heading, vehicles.speed, vehicles.size):  # fmt: skip
+            array.setflags(write=True)
+            array[:] = 99.0
+        object.__setattr__(known.robot, "v_mps", 99.0)
+        object.__setattr__(known.signals["x"], "walk", True)
+        known.signals["y"] = Signal(True)  # type: ignore[index]
+        return STILL
+
+    known = knowledge()
+    observation = seen(known=known)
+    Driver(Fake(scribbles, dataclasses.replace(MINE, privileged=True))).act(observation)
+    assert (observation.rgb == 7).all()
+    again = knowledge()
+    for kind in ("people", "vehicles"):
+        mine, fresh = getattr(known, kind), getattr(again, kind)
+        for field in dataclasses.fields(mine):
+            assert np.array_equal(getattr(mine, field.name), getattr(fresh, field.name)), field.name
+    assert known.robot == again.robot and dict(known.signals) == dict(again.signals)
+    assert np.array_equal(known.route.points, again.route.points) and known.route.length_m == 9.0
+
+
+def test_a_route_stays_the_same_object_through_an_episode() -> None:
+    """A policy may prepare its route once."""
+    routes: list[object] = []
+
+    def notes(observation: Observation) -> Command:
+        assert observation.privileged is not None
+        routes.append(observation.privileged.route)
+        return STILL
+
+    driver, known = Driver(Fake(notes, dataclasses.replace(MINE, privileged=True))), knowledge()
+    for tick in (0, 5):
+        driver.act(seen(tick, known))
+    driver.reset("next", 0)
+    driver.act(seen(0, known))
+    assert routes[0] is routes[1] and routes[2] is not routes[0]
+
+
+def test_a_manifest_is_read_once() -> None:
+    """A policy that declares itself privileged in the middle of an episode still knows nothing."""
+    known: list[object] = []
+
+    def greedy(observation: Observation) -> Command:
+        known.append(observation.privileged)
+        policy.manifest = Manifest("mine", camera=None, privileged=True, waypoint_dt_s=1e-9)
+        return STILL
+
+    policy = Fake(greedy)
+    driver = Driver(policy)
+    for tick in range(3):
+        driver.act(seen(tick, knowledge()))
+    assert known == [None] * 3 and driver.manifest == MINE
+
+
+def test_a_child_that_a_policy_forks_does_not_go_on_with_the_episode() -> None:
+    """It ends where the policy returns."""
+    read, write = os.pipe()
+
+    def forks(_: Observation) -> Command:
+        os.fork()
+        return STILL
+
+    Driver(Fake(forks)).act(seen())
+    os.write(write, b"x")
+    _, status = os.wait()
+    assert os.read(read, 10) == b"x" and os.waitstatus_to_exitcode(status) == 1
+
+
+def test_a_policy_at_work_is_timed() -> None:
+    """Every question is told when it begins and ends, also if it ends badly; the first answer is told apart."""
+    told: list[tuple[str, int] | None] = []
+
+    class Notes:
+        def starts(self, doing: Doing, tick: int) -> None:
+            told.append((doing, tick))
+
+        def stops(self) -> None:
+            told.append(None)
+
+    driver = Driver(Fake(lambda _: STILL), timer=Notes())
+    driver.reset("a", 0)
+    driver.act(seen(0))
+    driver.act(seen(5))
+    with pytest.raises(PolicyError):
+        driver.reset("bad", 0)
+    assert told == [("reset", 0), None, ("first act", 0), None, ("act", 5), None, ("reset", 0), None]

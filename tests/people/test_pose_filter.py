@@ -1,0 +1,84 @@
+"""The pose filter on made-up tracks."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Floats, wrap_angle
+from sumo_nets.crowd.pose_filter import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
+
+DT_S = 0.05
+
+
+def east(name: str) -> float:
+    """Everybody enters facing along x."""
+    return 0.0
+
+
+def shown(track: Floats, facing_rad: float = 0.0) -> tuple[Floats, Floats, Floats]:
+    """What the filter shows of one person on a track (T, 2), facing so at first: (T, 2), (T,), (T,)."""
+    poses = PoseFilter(DT_S)
+    speed = np.hypot(*np.diff(track, axis=0, prepend=track[:1]).T) / DT_S
+    rows = [poses.update(("c1",), track[i : i + 1], speed[i : i + 1], lambda _: facing_rad) for i in range(len(track))]
+    xy, facing, fast = (np.concatenate([row[k] for row in rows]) for k in range(3))
+    return xy, facing, fast
+
+
+def walk(seconds: float, mps: float = 1.4) -> Floats:
+    t = np.arange(0.0, seconds, DT_S)
+    return np.column_stack([mps * t, np.zeros_like(t)])
+
+
+def test_an_even_walk_is_shown_as_it_is() -> None:
+    """A person who walks evenly is shown exactly where it is, at its speed."""
+    track = walk(3.0)
+    xy, facing, speed = shown(track)
+    np.testing.assert_allclose(xy, track, atol=1e-12)
+    np.testing.assert_allclose(facing, 0.0, atol=1e-12)
+    np.testing.assert_allclose(speed[1:], 1.4)
+
+
+def test_a_jump_becomes_a_brisk_walk_that_catches_up() -> None:
+    """After a jump of 2 m sideways nobody is shown faster than the limit, and the gap closes."""
+    track = walk(8.0)
+    track[40:, 1] += 2.0
+    xy, _, speed = shown(track)
+    assert speed.max() <= MAX_SPEED_MPS + 1e-9
+    assert np.hypot(*np.diff(xy, axis=0).T).max() <= MAX_SPEED_MPS * DT_S + 1e-9
+    np.testing.assert_allclose(xy[-1], track[-1], atol=1e-9)
+
+
+def test_the_heading_follows_the_motion_and_turns_like_a_body() -> None:
+    """A turn on the spot by 90 degrees takes at least half a second."""
+    track = walk(3.0)
+    corner = np.concatenate([track, track[-1] + walk(3.0)[1:, ::-1]])
+    _, facing, _ = shown(corner)
+    turns = [abs(wrap_angle(b - a)) for a, b in itertools.pairwise(facing)]
+    assert max(turns) <= MAX_TURN_RADPS * DT_S + 1e-9
+    assert facing[-1] == pytest.approx(math.pi / 2, abs=0.01)
+
+
+def test_a_standing_person_keeps_facing_where_it_faced() -> None:
+    """Small shuffles of a standing person do not turn it."""
+    rest = np.zeros((60, 2))
+    rest[:, 1] = 0.005 * (np.arange(60) % 2)
+    _, facing, _ = shown(rest, facing_rad=1.0)
+    np.testing.assert_allclose(facing, 1.0)
+
+
+def test_people_come_and_go() -> None:
+    """Each id keeps its own pose whatever its row; who left and comes back is new."""
+    poses = PoseFilter(DT_S)
+    ab = np.array([[0.0, 0.0], [10.0, 0.0]])
+    poses.update(("a", "b"), ab, np.zeros(2), east)
+    bc = np.array([[0.0, 0.0], [20.0, 0.0]])
+    xy, _, _ = poses.update(("b", "c"), bc, np.zeros(2), east)
+    assert xy[0] == pytest.approx([10.0 - MAX_SPEED_MPS * DT_S, 0.0]) and xy[1] == pytest.approx(bc[1])
+    empty = poses.update((), np.zeros((0, 2)), np.zeros(0), east)
+    assert [len(part) for part in empty] == [0, 0, 0]
+    xy, _, _ = poses.update(("b",), ab[:1], np.zeros(1), east)
+    assert xy[0] == pytest.approx(ab[0])

@@ -1,0 +1,83 @@
+"""Nobody walks through anybody."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sumo_nets.crowd.separation import KEEP_M, kept_apart
+
+REACH_M = 2.2 * 0.05
+
+
+def walked(start: np.ndarray, goal: np.ndarray, firm: np.ndarray) -> list[np.ndarray]:
+    """Where people are who walk from (N, 2) to (N, 2) at 1.4 m/s, tick by tick; who is firm steps as it wants."""
+    at, track = start.astype(float), []
+    for _ in range(200):
+        away = goal - at
+        far = np.maximum(np.hypot(*away.T), 1e-9)[:, None]
+        at = kept_apart(at, at + away / far * np.minimum(far, 0.07), firm, REACH_M)
+        track.append(at)
+    return track
+
+
+@pytest.mark.parametrize("aside_m", [0.0, 0.1, -0.3])
+@pytest.mark.parametrize("firm", [False, True])
+def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: bool) -> None:
+    """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the reach of a step."""
+    start, goal = np.array([[-4.0, 0.0], [4.0, aside_m]]), np.array([[4.0, 0.0], [-4.0, aside_m]])
+    track = walked(start, goal, np.array([firm, False]))
+    assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * KEEP_M
+    assert np.hypot(*(track[-1] - goal).T).max() < 0.05
+    steps = np.diff(np.array([start, *track]), axis=0)
+    assert np.hypot(steps[..., 0], steps[..., 1]).max() <= REACH_M + 1e-9
+
+
+def test_who_is_firm_does_not_give_way() -> None:
+    """An event pedestrian walks its line to the millimetre; the other goes round it."""
+    start, goal = np.array([[-4.0, 0.0], [4.0, 0.0]]), np.array([[4.0, 0.0], [-4.0, 0.0]])
+    track = walked(start, goal, np.array([True, False]))
+    assert all(at[0, 1] == 0.0 for at in track)
+    assert max(abs(float(at[1, 1])) for at in track) > 0.8 * KEEP_M
+
+
+def test_a_throng_at_one_place_parts() -> None:
+    """Eight who all want to stand at the same place end up side by side, none in another."""
+    rng = np.random.default_rng(1)
+    track = walked(rng.uniform(-2.0, 2.0, (8, 2)), np.zeros((8, 2)), np.zeros(8, dtype=bool))
+    gaps = np.hypot(*(track[-1][:, None] - track[-1][None]).transpose(2, 0, 1)) + 9.0 * np.eye(8)
+    assert gaps.min() > 0.3
+
+
+def test_who_is_alone_walks_as_it_wants() -> None:
+    """Without anybody near the very same values come back."""
+    before = np.array([[0.0, 0.0], [2.0, 0.0]])
+    wanted = before + 0.07
+    assert kept_apart(before, wanted, np.zeros(2, dtype=bool), REACH_M) is wanted
+
+
+def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
+    """Somebody that SUMO has stopped among three talkers comes as near as shoulders allow, and then does not stir."""
+    angles = np.pi / 2 + 2.0 * np.pi * np.arange(3) / 3
+    talkers = 0.62 * np.column_stack([np.cos(angles), np.sin(angles)])
+    start = np.vstack([talkers, [[0.2, 0.38]]])
+    goal = np.vstack([talkers, [[0.33, 0.36]]])
+    firm, stand = np.array([True, True, True, False]), np.array([False, False, False, True])
+    at, steps = start, []
+    for _ in range(100):
+        to = kept_apart(at, goal, firm, REACH_M, stand)
+        steps.append(float(np.hypot(*(to[3] - at[3]))))
+        at = to
+    assert np.hypot(*(at[:3] - at[3]).T).min() > 0.9 * KEEP_M
+    assert max(steps[40:]) == 0.0
+
+
+def test_who_stands_gives_way_to_who_comes_through() -> None:
+    """Standing is a wish, too: a walker is not held up by somebody that could step aside."""
+    at = np.array([[-2.0, 0.0], [0.0, 0.0]])
+    for _ in range(100):
+        wanted = np.array([at[0] + (0.07, 0.0), [0.0, 0.0]])
+        at = kept_apart(at, wanted, np.array([False, False]), REACH_M, np.array([False, True]))
+        assert np.hypot(*(at[1] - at[0])) > 0.9 * KEEP_M
+    assert at[0, 0] > 2.0
+    assert np.hypot(*at[1]) < 0.05

@@ -1,0 +1,83 @@
+"""People step round the robot."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose, box_disk_gap
+from cosim.people.yielding import KEEP_M, Body, stepped_round
+
+HALF = (0.36, 0.29)
+STEP_M = 1.4 * 0.05
+
+
+def gap(xy: np.ndarray, robot: Pose) -> float:
+    return float(box_disk_gap(np.array([robot]), *HALF, xy[None])[0, 0]) - 0.3
+
+
+@pytest.mark.parametrize("aside_m", [0.0, 0.05, -0.3, 0.6])
+@pytest.mark.parametrize("heading", [0.0, 0.7, math.pi / 2])
+def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_m: float, heading: float) -> None:
+    """From any lateral offset and against any heading the walker gets to the other side and never overlaps."""
+    robot = Pose(0.0, 0.0, heading)
+    xy, goal = np.array([[4.0, aside_m]]), np.array([[-4.0, aside_m]])
+    nearest = math.inf
+    for _ in range(250):
+        away = goal - xy
+        far = max(float(np.hypot(*away[0])), 1e-9)
+        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), Body(robot, HALF))
+        nearest = min(nearest, gap(xy, robot))
+    assert nearest > 0.0
+    assert float(np.hypot(*(goal - xy)[0])) < 0.2
+
+
+def test_a_robot_that_drives_at_somebody_hits_them() -> None:
+    """Only a person's own steps are changed: who stands still is not moved out of the robot's way."""
+    person = np.array([[1.0, 0.0]])
+    for x_m in np.arange(0.0, 0.8, 0.1):
+        assert np.array_equal(stepped_round(person, person, Body(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person)
+    assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
+
+
+def test_people_who_are_not_near_walk_as_they_want() -> None:
+    """Far from the robot, beside it, and walking away from it nothing changes."""
+    before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + KEEP_M + 0.05], [0.7, 0.0]])
+    wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
+    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF)), wanted)
+
+
+def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
+    """A person and a robot at 1.5 m/s meet head-on: the person gets out of its way before they touch."""
+    xy = np.array([[6.0, 0.1]])
+    nearest = math.inf
+    for tick in range(80):
+        robot = Pose(1.5 * 0.05 * tick, 0.0, 0.0)
+        xy = stepped_round(xy, xy - np.array([[STEP_M, 0.0]]), Body(robot, HALF, 1.5))
+        nearest = min(nearest, gap(xy, Pose(1.5 * 0.05 * (tick + 1), 0.0, 0.0)))
+    assert nearest > 0.0
+    assert float(xy[0, 0]) < 1.5 * 0.05 * 80 - 1.0
+
+
+def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
+    """A slower person in front keeps walking and is run into: the robot has to watch out."""
+    before = np.array([[0.8, 0.0]])
+    wanted = before + np.array([[0.03, 0.0]])
+    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)
+
+
+@pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
+def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
+    """Somebody who waits comes up to the robot, a hand's breadth away, and then stands still."""
+    body, place = Body(Pose(0.0, 0.0, 0.0), HALF), np.array([x_m, 0.45])
+    xy, ways = np.array([[2.0, 1.2]]), []
+    for _ in range(100):
+        away = place - xy
+        step = away * (0.11 / max(float(np.hypot(*away[0])), 0.11))
+        after = stepped_round(xy, xy + step, body, np.array([True]))
+        ways.append(float(np.hypot(*(after - xy)[0])))
+        xy = after
+    assert sum(ways[60:]) < 1e-4
+    assert KEEP_M - 1e-6 < gap(xy, body.pose) < KEEP_M + 0.11

@@ -1,0 +1,378 @@
+"""Street furniture, paving and relief: what stands where, what stays free, what the ground is like."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import os
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from cosim.core.errors import UsageError
+from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import LABELS, Command, RobotState, Street
+from cosim.episode.ports import CameraSpec
+from cosim.place.street_map import StreetMap, Strip
+from cosim.spec.scenario import City
+from physics.cameras.bullet_camera import BulletCamera
+from physics.street.buildings import Frontage
+from physics.street.clearance import clear_width, on_driveways
+from physics.street.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
+from physics.street.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, street_style
+from physics.world.materials import MATERIALS, PAVINGS, Paving, friction, street_of
+from physics.world.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
+from physics.world.world import BulletWorld
+from sumo_nets.city.store import city_net
+from sumo_nets.net.netfile import read_net
+from tests.tiny_street import tiny_map
+
+BASE = tiny_map()
+CLASSES = {"nw": "commercial", "ne": "residential", "sw": "boulevard", "se": "narrow"}
+MAP: StreetMap = dataclasses.replace(
+    BASE,
+    strips={
+        name: dataclasses.replace(s, street_class=CLASSES.get(name, ""), verge_m=1.5 if name in ("sw", "se") else 0.0)
+        for name, s in BASE.strips.items()
+    },
+    _trees={},
+)
+EMPTY = Street(0)
+SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"
+
+
+def placed(street_map: StreetMap, seed: int) -> tuple[Placement, Frontage]:
+    frontage = Frontage(street_map, seed)
+    return Placement(street_map, seed, frontage), frontage
+
+
+def sidewalks(street_map: StreetMap) -> list[Strip]:
+    return [s for s in street_map.strips.values() if s.kind == "sidewalk"]
+
+
+def all_props(street_map: StreetMap, seed: int) -> list[Prop]:
+    placement, _ = placed(street_map, seed)
+    return [prop for strip in sidewalks(street_map) for prop in placement.on_strip(strip)]
+
+
+@cache
+def city(seed: int, size_m: float = 600.0) -> StreetMap:
+    return read_net(city_net(City(seed=seed, size_m=size_m)))
+
+
+def foreign() -> list[Path]:
+    names = ("berlin-neukoelln", "taipei", "west-oakland")
+    return [net for name in names for net in sorted((SHARED / name).glob("*.net.xml.gz"))[:1]]
+
+
+@pytest.mark.parametrize("kind", CATALOGUE, ids=lambda kind: kind.name)
+def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
+    """Every size has few triangles, reaches the ground, fills its footprint below the heads and bumps within it."""
+    entry = KINDS[kind.name]  # type: ignore[attr-defined]
+    looks = range(len(entry.paints) if entry.grown else 1)
+    for variant, look in itertools.product(range(VARIANTS), looks):
+        length, depth, height = entry.size_m(variant)
+        parts = parts_of(entry.name, variant, look)
+        vertices = np.concatenate([part.mesh.vertices for part in parts])
+        assert sum(len(part.mesh) for part in parts) <= {"tree": 300, "car": 170}.get(entry.name, 90)
+        assert -1e-9 <= vertices[:, 2].min() < 0.051
+        assert vertices[:, 2].max() == pytest.approx(height, abs=0.06)
+        low = vertices[vertices[:, 2] < 1.75] if entry.name != "shelter" else vertices[vertices[:, 2] < 2.0]
+        assert np.abs(low[:, 0]).max() <= 0.5 * length + 0.02
+        assert np.abs(low[:, 1]).max() <= 0.5 * depth + 0.02
+        for solid in solids_of(entry.name, variant):
+            assert abs(solid.at_m[0]) + 0.5 * solid.size_m[0] <= 0.5 * length + 1e-9
+            assert abs(solid.at_m[1]) + 0.5 * solid.size_m[1] <= 0.5 * depth + 1e-9
+
+
+def test_crowns_are_closed_and_keep_to_their_room() -> None:
+    """Of every tree: each edge of the crown has two sides, it hangs above the heads, within its spread, all lit."""
+    kind = KINDS["tree"]
+    for variant, look in itertools.product(range(VARIANTS), range(len(kind.paints))):
+        crown = parts_of("tree", variant, look)[1]
+        t = crown.mesh.triangles
+        edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
+        assert {tuple(e) for e in edges.tolist()} == {tuple(e) for e in edges[:, ::-1].tolist()}
+        one, two = (crown.mesh.vertices[t[:, i]] - crown.mesh.vertices[t[:, 0]] for i in (1, 2))
+        outward = crown.mesh.vertices[t].mean(axis=1) - crown.mesh.vertices.mean(axis=0)
+        assert ((np.cross(one, two) * outward).sum(axis=1) > 0.0).mean() > 0.97
+        assert crown.mesh.vertices[:, 2].min() > 2.1
+        assert np.hypot(*crown.mesh.vertices[:, :2].T).max() < kind.spread_m + 0.1
+        assert crown.shade is not None and 0.2 < crown.shade.min() < crown.shade.max() <= 1.0
+
+
+def test_what_is_drawn_may_be_turned_and_bumps_as_before() -> None:
+    """Lamps behind a sidewalk turn their arms to the road, trees each their own way; headings are left alone."""
+    for seed in range(4):
+        for prop in all_props(MAP, seed):
+            if prop.kind == "lamp":
+                strip = MAP.strips[prop.id.split(":")[1]]
+                aside = prop.drawn_rad + 0.5 * math.pi
+                arm = np.array([prop.x_m + math.cos(aside), prop.y_m + math.sin(aside)])
+                road = (
+                    Polyline(strip.line).project(*arm.tolist())[1] - Polyline(strip.line).project(prop.x_m, prop.y_m)[1]
+                )
+                assert road * strip.road_side > 0.9
+            elif prop.kind != "tree":
+                assert prop.drawn_rad == prop.heading_rad
+
+
+def test_street_classes_of_any_map_have_a_column() -> None:
+    """Our own classes are themselves; types of imported edges go by their words; the rest are residential."""
+    assert street_style("boulevard") == "boulevard"
+    assert street_style("highway.primary_link") == "avenue"
+    assert street_style("highway.living_street") == "narrow"
+    assert street_style("highway.footway") == street_style("") == "residential"
+    assert all({*kind.per_100m} == {*CATALOGUE[0].per_100m} for kind in CATALOGUE)
+
+
+def test_props_keep_off_what_is_not_theirs() -> None:
+    """Over several seeds: no prop on a corner, a road, a crossing, another prop, a house, or near a strip's end."""
+    street = shapely.union_all([p.polygon for p in (*MAP.corners.values(), *MAP.lanes.values()) if "_0" not in p.id])
+    zebra = MAP.strips[":c0"].polygon
+    for seed in range(6):
+        placement, frontage = placed(MAP, seed)
+        props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)]
+        ground = footprints(props)
+        assert len(props) > 25
+        assert shapely.distance(ground, street).min() > 0.0
+        assert shapely.distance(ground, zebra).min() >= END_M
+        assert len(shapely.STRtree(ground).query(ground, predicate="intersects")[0]) == len(ground)
+        houses = [b.polygon for key in keys_within(0.0, 0.0, 120.0) for b in frontage.in_tile(key)]
+        assert not len(shapely.STRtree(houses).query(ground, predicate="intersects")[0])
+        for prop, footprint in zip(props, ground, strict=True):
+            strip = MAP.strips[prop.id.split(":")[1]]
+            line = Polyline(strip.line)
+            along = [line.project(x, y)[0] for x, y in shapely.get_coordinates(footprint)]
+            assert min(along) >= END_M - 1e-6 and max(along) <= line.length_m - END_M + 1e-6
+
+
+def test_the_middle_of_a_sidewalk_is_free() -> None:
+    """No footprint comes nearer to the middle line than the clear half width, which is at least 0.6 m."""
+    for seed in range(6):
+        for prop, footprint in zip(props := all_props(MAP, seed), footprints(props), strict=True):
+            strip = MAP.strips[prop.id.split(":")[1]]
+            half = clear_half_m(strip)
+            assert half >= CLEAR_HALF_M
+            assert shapely.distance(shapely.linestrings(strip.line), footprint) >= half
+
+
+def test_props_do_not_depend_on_the_order_but_on_the_seed() -> None:
+    """Tiles asked for in any order hold the same props, each in one tile alone; another seed gives others."""
+    keys = keys_within(0.0, 0.0, 100.0)
+    one, two, other = (placed(MAP, seed)[0] for seed in (4, 4, 5))
+    forward = {key: one.in_tile(key) for key in keys}
+    backward = {key: two.in_tile(key) for key in reversed(keys)}
+    assert forward == backward
+    assert forward != {key: other.in_tile(key) for key in keys}
+    ids = [prop.id for props in forward.values() for prop in props]
+    assert len(ids) == len(set(ids)) == len(all_props(MAP, 4))
+    assert all(key_at(prop.x_m, prop.y_m) == key for key, props in forward.items() for prop in props)
+
+
+def test_streets_differ_by_their_class() -> None:
+    """Trees stand on boulevards and not in narrow streets, cafés rather in commercial ones; all kinds are found."""
+    found: dict[str, list[str]] = {}
+    for seed in range(12):
+        for prop in all_props(MAP, seed):
+            found.setdefault(CLASSES[prop.id.split(":")[1]], []).append(prop.kind)
+    assert found["boulevard"].count("tree") > 20 and "tree" not in found["narrow"]
+    assert found["commercial"].count("cafe") > found["residential"].count("cafe")
+    assert {kind for kinds in found.values() for kind in kinds} >= set(KINDS) - {"car", "shelter"}
+
+
+def test_the_checker_finds_a_prop_in_the_way() -> None:
+    """The least free width over the middle is measured at the prop, and is 0 where it stands on the middle line."""
+    strip = MAP.strips["nw"]
+    bench = Prop("prop:nw:0", "bench", 0, -40.0, 6.2, 0.0, 0)
+    width, bare = clear_width([strip], [bench])["nw"]
+    assert (width, bare) == (pytest.approx(3.0 - 0.3 - 0.225), pytest.approx(3.0))
+    middle = dataclasses.replace(bench, y_m=5.0)
+    assert clear_width([strip], [middle])["nw"][0] == 0.0
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("seed", [11, 37, 5])
+def test_generated_cities_leave_a_way(seed: int) -> None:
+    """On every sidewalk of a city at least 1.2 m stay free on the final geometry, and there is furniture."""
+    street_map = city(seed)
+    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    widths = clear_width(strips, props)
+    assert min(free for free, _ in widths.values()) >= 1.2 - 1e-6
+    assert len(props) > 0.06 * sum(strip.length_m for strip in strips)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("seed", [11, 37, 5])
+def test_driveways_are_open(seed: int) -> None:
+    """Nothing but parked cars, behind the sidewalk, stands where a driveway or the flares of its ramp are."""
+    street_map = city(seed)
+    strips, props = sidewalks(street_map), all_props(street_map, seed)
+    assert sum(len(strip.driveways) for strip in strips) > 20
+    assert on_driveways(strips, props) == []
+    cars = [prop for prop in props if prop.kind == "car"]
+    assert cars
+    for car, footprint in zip(cars, footprints(cars), strict=True):
+        assert shapely.distance(footprint, street_map.strips[car.id.split(":")[1]].polygon) > 0.0
+    strip = next(strip for strip in strips if strip.driveways)
+    x, y, heading = Polyline(strip.line).at(strip.driveways[0])
+    assert on_driveways(strips, [Prop("prop:here:0", "bin", 0, x, y, heading, 0)]) == ["prop:here:0"]
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not foreign(), reason="the shared maps are not here")
+@pytest.mark.parametrize("path", foreign(), ids=lambda path: path.parent.name)
+def test_foreign_maps_leave_a_way(path: Path) -> None:
+    """Props take nothing from a sidewalk below 1.2 m: what is narrower stays as it is."""
+    street_map = read_net(path)
+    widths = clear_width(sidewalks(street_map), all_props(street_map, 3))
+    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in widths.values())
+
+
+@pytest.mark.engine
+def test_a_prop_stops_the_robot_and_is_named() -> None:
+    """Driven at a prop the robot touches it, whatever its kind: an object, by its id; and it does not pass."""
+    placement, _ = placed(MAP, 1)
+    chosen = {prop.kind: prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)}
+    assert len(chosen) > 8
+    with BulletWorld(MAP, seed=1) as world:
+        for prop in chosen.values():
+            y = MAP.strips[prop.id.split(":")[1]].line[0, 1]
+            toward = math.copysign(math.pi / 2, prop.y_m - y)
+            world.place(Pose(prop.x_m + 0.2, float(y), toward))
+            motions = [world.step(Command(0.6, 0.0), EMPTY, EMPTY, 10) for _ in range(120)]
+            contacts = {(c.kind, c.other) for motion in motions for c in motion.contacts}
+            assert contacts == {("object", prop.id)}, prop
+            assert abs(motions[-1].robot.pose.y_m - y) < abs(prop.y_m - y)
+
+
+@pytest.mark.engine
+def test_a_prop_is_seen_where_it_stands() -> None:
+    """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground, at its distance."""
+    placement, _ = placed(MAP, 1)
+    props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip) if prop.kind in ("bin", "planter")]
+    with BulletCamera(BulletWorld(MAP, seed=1), CameraSpec(96, 96), depth=True) as camera:
+        for prop in props[:4]:
+            y = float(MAP.strips[prop.id.split(":")[1]].line[0, 1])
+            toward = math.copysign(math.pi / 2, prop.y_m - y)
+            away = 3.0 * math.copysign(1.0, y - prop.y_m)
+            frame = camera.render(RobotState(Pose(prop.x_m, prop.y_m + away, toward), z_m=0.12), EMPTY)
+            assert frame.labels is not None and frame.depth is not None
+            rows = np.flatnonzero(frame.labels[:, 48] == LABELS["prop"])
+            assert len(rows) > 5
+            assert frame.labels[rows.max() + 1, 48] in (LABELS["verge"], LABELS["ground"])
+            nearest = 3.0 - 0.5 * prop.size_m[1] - frame.depth[rows, 48].min()
+            assert 0.0 < nearest < 0.5
+
+
+def test_names_of_edges_give_their_street() -> None:
+    """Both directions and all pieces of a street are one street."""
+    assert {street_of(edge) for edge in ("s12", "-s12", "-s12a", "s12b")} == {"s12"}
+    assert {street_of(edge) for edge in ("-27#3", "27#-1", "27")} == {"27"}
+    assert street_of("gneE1") != street_of("gneE2")
+
+
+def test_streets_differ_by_their_paving() -> None:
+    """The paving of a street is the same for both sides and each time, differs by seed, and every class has several."""
+    strips = [
+        dataclasses.replace(MAP.strips["nw"], id=f"{sign}s{i}", street_class=name)
+        for name in ("residential", "commercial", "narrow")
+        for i in range(20)
+        for sign in ("", "-")
+    ]
+    one, two, other = (Paving(MAP, seed) for seed in (1, 1, 2))
+    surfaces = [one.surface(strip) for strip in strips]
+    assert surfaces == [two.surface(strip) for strip in strips]
+    assert surfaces != [other.surface(strip) for strip in strips]
+    assert surfaces[::2] == surfaces[1::2]
+    assert {name.split(":")[1] for name in surfaces} == set(MATERIALS) - {"grass"}
+    assert all(name in PAVINGS for name in surfaces)
+    assert friction("sidewalk:brick:0") < friction("sidewalk") < friction("sidewalk:asphalt:1")
+    assert friction("verge") == friction("verge:grass:1") == MATERIALS["grass"].friction
+
+
+def test_paved_ground_has_the_shape_of_plain_ground() -> None:
+    """A paved tile covers its square once, at the same heights, kind by kind the same areas; corners stay plain."""
+    paving = Paving(MAP, 1)
+    for key in keys_within(0.0, 0.0, 40.0):
+        plain, paved = build_tile(MAP, key), build_tile(MAP, key, paving)
+        areas: dict[str, list[float]] = {}
+        for side, tile in enumerate((plain, paved)):
+            for name, mesh in tile.parts.items():
+                corners = mesh.vertices[mesh.triangles]
+                one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+                area = 0.5 * (one[:, 0] * two[:, 1] - one[:, 1] * two[:, 0]).sum()
+                areas.setdefault(kind_of(name), [0.0, 0.0])[side] += area
+                low, high = mesh.vertices[:, 2].min(), mesh.vertices[:, 2].max()
+                assert low >= 0.0 and high <= CURB_M + 1e-9
+        assert all(one == pytest.approx(two, abs=1e-3) for one, two in areas.values())
+        assert sum(two for _, two in areas.values()) == pytest.approx(TILE_M**2, abs=1e-6)
+        for name in set(paved.parts) - set(plain.parts):
+            mesh = paved.parts[name]
+            middles = mesh.vertices[mesh.triangles].mean(axis=1)
+            strips = [s for s in sidewalks(MAP) if paving.surface(s) == name]
+            lanes = [lane for lane in MAP.lanes.values() if paving.surface(lane) == name]
+            where = shapely.union_all([p.polygon for p in (*strips, *lanes)])
+            assert shapely.contains_xy(shapely.buffer(where, 0.01), middles[:, 0], middles[:, 1]).all()
+
+
+def rough_height(tile: Tile, xy: np.ndarray) -> np.ndarray:
+    """Heights of a tile's own triangles at points on high ground, from the mesh."""
+    found = np.full(len(xy), np.nan)
+    for name in tile.parts:
+        mesh = tile.parts[name]
+        corners = mesh.vertices[mesh.triangles]
+        tree = shapely.STRtree(shapely.polygons(corners[:, :, :2]))
+        point, triangle = tree.query(shapely.points(xy), predicate="within")
+        for i, k in zip(point.tolist(), triangle.tolist(), strict=True):
+            a, b, c = corners[k]
+            normal = np.cross(b - a, c - a)
+            found[i] = a[2] - ((xy[i] - a[:2]) @ normal[:2]) / normal[2]
+    return found
+
+
+def test_rough_ground_is_a_shape_of_its_own_and_flat_ground_is_untouched() -> None:
+    """At 0 nothing changes; above it the mesh follows `height`, tiles meet, ramps stay, roads get potholes."""
+    key = (0, 0)
+    flat, zero = build_tile(MAP, key), build_tile(MAP, key, roughness=0.0, seed=9, roots=[(10.0, 5.0)])
+    assert all(np.array_equal(mesh.vertices, zero.parts[name].vertices) for name, mesh in flat.parts.items())
+    rough = build_tile(MAP, key, roughness=1.0, seed=9, roots=[(10.0, 5.0)])
+    rng = np.random.default_rng(0)
+    points = np.column_stack([rng.uniform(5.0, 45.0, 400), rng.uniform(3.8, 6.3, 400)])
+    there = rough_height(rough, points)
+    known = np.isfinite(there)
+    assert known.mean() > 0.95
+    assert np.abs(there - rough.height(points))[known].max() < 0.012
+    assert np.ptp(there[known]) > 0.03 and np.abs(there[known] - CURB_M).max() < 0.1
+    assert rough.height([[10.0, 5.0]])[0] > build_tile(MAP, key, roughness=1.0, seed=9).height([[10.0, 5.0]])[0] + 0.02
+    other = build_tile(MAP, (-1, 0), roughness=1.0, seed=9)
+    border = np.column_stack([np.full(50, 0.4137), np.linspace(1.0, 20.0, 50)])
+    assert np.allclose(rough.height(border), other.height(border), atol=1e-9)
+    ramp = np.array([[0.5, 3.5 + d] for d in (0.001, 0.01)])
+    assert np.allclose(rough.height(ramp), flat.height(ramp), atol=1e-3)
+    tiles = [build_tile(MAP, (i, j), roughness=1.0, seed=9) for i in (-1, 0) for j in (-1, 0)]
+    road = np.concatenate([tile.parts["road"].vertices[:, 2] for tile in tiles])
+    assert road.min() == pytest.approx(-0.05, abs=1e-3) and road.max() == 0.0
+
+
+@pytest.mark.engine
+def test_the_robot_feels_rough_ground() -> None:
+    """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly tilts."""
+    tilts = {}
+    for roughness in (0.0, 1.0):
+        with BulletWorld(MAP, seed=3, roughness=roughness) as world:
+            world.place(Pose(8.0, 5.0, 0.0))
+            robots = [world.step(Command(1.0, 0.0), EMPTY, EMPTY, 10).robot for _ in range(300)]
+        assert robots[-1].pose.x_m > 20.0
+        tilts[roughness] = max(robot.tilt_rad for robot in robots)
+    assert tilts[0.0] < 0.01 < tilts[1.0] < 0.12
+
+
+def test_roughness_has_a_range() -> None:
+    """A roughness beyond 1 is refused with the range."""
+    with pytest.raises(UsageError, match=r"roughness is 1\.5, but it lies between 0 \(flat\) and 1"):
+        BulletWorld(MAP, seed=1, roughness=1.5)

@@ -1,0 +1,142 @@
+"""People as the gl camera draws them: levels of detail keep the silhouettes, poses are those of the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import moderngl
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from cosim.core.state import LABELS, People
+from physics.cameras.gl import crowd as crowds
+from physics.cameras.gl.camera import NOON
+from physics.cameras.gl.context import available, context
+from physics.cameras.gl.crowd import LEVEL_PX, Crowd
+from physics.cameras.gl.lighting import lighting_of
+from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
+from physics.cameras.gl.targets import Target
+from physics.cameras.sky import sky_of
+from physics.cameras.view import Shot, shot
+from physics.people.body import body
+from physics.people.clips import own_clips
+from physics.people.figure import LEVELS
+from physics.people.looks import ALL, look
+from physics.people.poses import poses
+from physics.people.skeleton import skinned
+
+pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
+
+WIDE = 512, 288
+
+
+def street(seed: int, count: int = 50) -> People:
+    """A busy street before an eye at the origin that looks along x: 3 to 35 m away."""
+    rng = np.random.default_rng(seed)
+    far = 3.0 + 32.0 * np.sqrt(rng.uniform(0.0, 1.0, count))
+    way = rng.uniform(-0.85, 0.85, count)
+    doing = rng.choice(["walk", "walk", "walk", "stand", "talk", "stop"], count).tolist()
+    pace = np.where([what == "walk" for what in doing], rng.uniform(0.5, 1.8, count), 0.0)
+    names = tuple(sorted(f"c{seed * count + i}" for i in range(count)))
+    xy = np.column_stack([far * np.cos(way), far * np.sin(way)])
+    return People.of(names, xy, rng.uniform(-3.0, 3.0, count), pace, tuple(doing), rng.uniform(0.0, 9.0, count))
+
+
+@contextmanager
+def drawing(crowd: Crowd, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+    gl, anchor = context(), anchor_of(taken.eye_m)
+    all_ = np.ones(len(people), dtype=bool)
+    crowd.set(people, 2.0, np.zeros(len(people)), taken, anchor, all_, all_)
+    block, target = SceneBlock(gl), Target(gl, taken.size)
+    block.write(camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1)))
+    target.frame.use()
+    gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+    gl.front_face, gl.depth_func = "cw", "<"
+    target.frame.clear(depth=1.0)
+    crowd.draw("colour")
+    yield target.read()
+    target.release()
+    block.release()
+
+
+def mask(crowd: Crowd, people: People, taken: Shot) -> NDArray[np.bool_]:
+    with drawing(crowd, people, taken) as (_, labels):
+        return np.asarray(labels == LABELS["person"])
+
+
+@pytest.fixture
+def crowd() -> Iterator[Crowd]:
+    with context() as gl:
+        crowd = Crowd(gl, False)
+        yield crowd
+        crowd.release()
+
+
+def test_levels_of_detail_keep_the_silhouettes(crowd: Crowd, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In pictures of busy streets levels of detail change less than 2 % of the silhouettes' pixels."""
+    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
+    scenes = [street(seed) for seed in range(4)]
+    levelled = [mask(crowd, people, taken) for people in scenes]
+    monkeypatch.setattr(crowds, "levels", lambda xy, z_m, taken: np.zeros(len(xy), dtype=np.intp))
+    full = [mask(crowd, people, taken) for people in scenes]
+    changed = sum(int((a ^ b).sum()) for a, b in zip(levelled, full, strict=True))
+    total = sum(int(b.sum()) for b in full)
+    print(f"{100 * changed / total:.2f} % of {total} silhouette pixels changed")
+    assert changed < 0.02 * total
+
+
+@pytest.mark.parametrize("level", range(1, LEVELS))
+def test_each_level_is_like_full_detail_where_it_begins(
+    crowd: Crowd, monkeypatch: pytest.MonkeyPatch, level: int
+) -> None:
+    """At the size at which a level begins it changes less than 2 % of silhouette pixels, the coarsest less than 3 %."""
+    far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
+    taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
+    changed = total = 0
+    for i in range(24):
+        people = People.of((f"c{i}",), [[0.0, 0.0]], [1.7 * i], [1.3 * (i % 3 > 0)], ("stand",), [0.37 * i])
+        shown = []
+        for forced in (level, 0):
+            monkeypatch.setattr(crowds, "levels", lambda xy, z_m, taken, k=forced: np.full(len(xy), k))
+            shown.append(mask(crowd, people, taken))
+        changed, total = changed + int((shown[0] ^ shown[1]).sum()), total + int(shown[1].sum())
+    print(f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} % changed")
+    assert changed < (0.03 if level == LEVELS - 1 else 0.02) * total
+
+
+def test_the_card_skins_as_the_reference_does(crowd: Crowd) -> None:
+    """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet where they belong."""
+    people = People.of(("c3",), [[5.0, 0.0]], [0.8], [1.4], ("walk",), [0.3])
+    taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
+    rows, columns = np.nonzero(mask(crowd, people, taken))
+    pose = poses(people, 2.0)
+    who = look("c3")
+    made = body(ALL[who.outfit], 1)
+    grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
+    at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]
+    cos, sin = np.cos(0.8), np.sin(0.8)
+    world = np.column_stack([cos * at[:, 0] - sin * at[:, 1] + 5.0, sin * at[:, 0] + cos * at[:, 1], at[:, 2]])
+    focal = 200.0 / np.tan(np.radians(20.0))
+    u, v = 200.0 - focal * world[:, 1] / world[:, 0], 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
+    assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
+    assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)
+
+
+def test_a_body_of_the_users_is_worn_by_everybody() -> None:
+    """With a body given, people near and far are drawn with it, in our poses."""
+    with context() as gl:
+        made = body(ALL[0], 1)
+        everybody = Crowd(gl, False, made, own_clips())
+        taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
+        assert mask(everybody, street(0), taken).sum() > 500
+        everybody.draw("moving")
+        everybody.release()
+
+
+def test_nobody_is_drawn_as_nothing(crowd: Crowd) -> None:
+    """Without people the picture stays empty, and drawing does no harm."""
+    taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
+    assert not mask(crowd, street(0, 0), taken).any()
+    crowd.draw("moving")

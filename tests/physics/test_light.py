@@ -1,0 +1,59 @@
+"""Light: its ranges, and that it changes a spec's hash only where it is spoken of."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cosim.core.errors import SpecError
+from cosim.spec.scenario import City, Light, Scenario, Suite, content_hash, read_suite, write_suite
+
+
+def scenario(light: Light) -> Scenario:
+    return Scenario(
+        id="s", suite="t", place=City(seed=1), seed=1, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+        route=((0.0, 0.0), (9.0, 0.0)), light=light,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "valid"),
+    [
+        ("hour", 24.5, "[0, 24]"), ("day_of_year", 0, "[1, 366]"), ("latitude_deg", float("nan"), "[-90, 90]"),
+        ("cloud_cover", 1.1, "[0, 1]"), ("fog_m", 0.0, "[10, 50000]"), ("exposure_ev", -5.0, "[-4, 4]"),
+    ],
+)  # fmt: skip
+def test_a_light_out_of_range_is_refused(field: str, value: float, valid: str) -> None:
+    """The message names the field, the valid range and the value."""
+    with pytest.raises(SpecError) as told:
+        Light(**{field: value})
+    assert str(told.value) == f"light {field} must be in {valid}, not {value}"
+
+
+def test_a_light_with_a_foreign_picture_is_refused() -> None:
+    """Only Radiance files are skies of the user's."""
+    with pytest.raises(SpecError, match=r"light hdri must be a Radiance \.hdr file, not 'sky\.exr'"):
+        Light(hdri="sky.exr")
+
+
+def test_default_light_leaves_the_bytes_of_a_scenario_alone() -> None:
+    """A scenario that does not speak of light has the hash it had before there was light; a dusk has another."""
+    plain, dusk = scenario(Light()), scenario(Light(hour=20.0))
+    before = {name: value for name, value in msgspec.to_builtins(plain).items() if name != "light"}
+    assert content_hash(plain) == content_hash(msgspec.convert(before, Scenario))
+    assert content_hash(plain) == "2797713881657898"
+    assert content_hash(plain) != content_hash(dusk) != content_hash(scenario(Light(hour=20.5)))
+
+
+def test_light_survives_a_suite_file(tmp_path: Path) -> None:
+    """Read again, each scenario has the light it was written with; a bad one is told with the file and the field."""
+    whole = Suite(name="t", version="1", scenarios=(scenario(Light(hour=20.0, fog_m=80.0)),))
+    write_suite(whole, tmp_path / "s.json")
+    assert read_suite(tmp_path / "s.json") == whole
+    text = (tmp_path / "s.json").read_text()
+    assert '"light":{"hour":20.0,"fog_m":80.0}' in text
+    (tmp_path / "bad.json").write_text(text.replace('"fog_m":80.0', '"fog_m":-80.0'))
+    with pytest.raises(SpecError, match=r"bad\.json: light fog_m must be in \[10, 50000\], not -80\.0"):
+        read_suite(tmp_path / "bad.json")

@@ -1,0 +1,123 @@
+"""Policies by name: what cannot be loaded is wrong use, told with the policy's name, whatever its code does."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cosim.core.errors import UsageError
+from cosim.episode.driver import Doing
+from cosim.policies import POLICIES
+from cosim.policies.load import load_policy
+
+GOOD = """
+from cosim.episode.ports import CameraSpec, Manifest
+from cosim.core.state import STILL
+class Mine:
+    manifest = Manifest("mine"{fields})
+    def reset(self, scenario_id, seed): pass
+    def act(self, observation): return STILL
+"""
+BAD = {
+    "exits": ("import sys; sys.exit(0)", "cannot be imported: SystemExit: 0"),
+    "interrupts": ("raise GeneratorExit", "cannot be imported: GeneratorExit"),
+    "raises": ("import nowhere_to_be_found", "cannot be imported: ModuleNotFoundError: No module named"),
+    "broken": ("def", "cannot be imported: SyntaxError"),
+    "exits-when-made": ("class Mine:\n def __init__(self): raise SystemExit(3)", "cannot be made: SystemExit: 3"),
+    "needs-more": ("class Mine:\n def __init__(self, x): pass", "cannot be made: TypeError"),
+    "no-manifest": ("class Mine: pass", "has no attribute 'manifest'"),
+    "odd-manifest": (
+        "class Mine:\n @property\n def manifest(self): raise SystemExit(1)\n",
+        "its manifest: SystemExit: 1",
+    ),
+    "no-act": (GOOD.replace("{fields}", "").replace("def act", "def drive"), "has no method 'act'"),
+    "number-as-name": (GOOD.replace('"mine"{fields}', "3"), "its manifest: Expected `str`, got `int`"),
+    "path-as-name": (GOOD.replace('"mine"{fields}', '"../mine"'), "name must be a text of 1 to 100 printable"),
+    "no-name": (GOOD.replace('"mine"{fields}', '""'), "name must be a text of 1 to 100 printable"),
+    "rate-as-text": (GOOD.replace("{fields}", ", rate_hz='4'"), "Expected `float`, got `str`"),
+    "rate-zero": (GOOD.replace("{fields}", ", rate_hz=0"), "a policy rate must be positive"),
+    "rate-nan": (GOOD.replace("{fields}", ", rate_hz=float('nan')"), "a policy rate must be positive"),
+    "rate-7": (GOOD.replace("{fields}", ", rate_hz=7"), "usual policy rates are 4, 5, 10, 20 Hz"),
+    "waypoints-now": (GOOD.replace("{fields}", ", waypoint_dt_s=0.0"), "waypoint_dt_s must be a positive number"),
+    "no-pixels": (GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"), "sides of 1 to 4096 pixels, not 0 x 96"),
+    "fish-eye": (GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"), "fov_deg must be between 0 and 180"),
+    "lost-mount": (
+        GOOD.replace("{fields}", ", camera=CameraSpec(mount_m=(0.0, float('inf'), 0.0))"),
+        "mount_m and pitch_down_deg must be finite",
+    ),
+}
+
+
+@pytest.fixture
+def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder in which a policy's module can be written."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    yield tmp_path
+    for name in ("mine", "base"):
+        sys.modules.pop(name, None)
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_policy_that_cannot_be_loaded_is_named_with_the_reason(desk: Path, name: str) -> None:
+    """Whatever its module, its class or its manifest does, SystemExit included."""
+    source, told = BAD[name]
+    (desk / "mine.py").write_text(source)
+    with pytest.raises(UsageError) as caught:
+        load_policy("mine:Mine")
+    assert "'mine:Mine'" in str(caught.value) and told in str(caught.value)
+
+
+def test_loading_leaves_the_process_where_it_is(desk: Path) -> None:
+    """A module that changes the folder changes no relative path of the run."""
+    (desk / "mine.py").write_text("import os; os.chdir('/')" + GOOD.format(fields=""))
+    assert load_policy("mine:Mine").manifest.name == "mine"
+    assert Path.cwd() == desk
+
+
+def test_loading_is_timed(desk: Path) -> None:
+    """Whoever waits for it can be told."""
+    told: list[Doing | None] = []
+
+    class Notes:
+        def starts(self, doing: Doing, tick: int) -> None:
+            told.append(doing)
+
+        def stops(self) -> None:
+            told.append(None)
+
+    (desk / "mine.py").write_text(GOOD.format(fields=""))
+    load_policy("mine:Mine", Notes()).reset("a", 0)
+    assert told == ["loading", None, "reset", None]
+
+
+def test_an_edited_policy_has_another_hash(desk: Path) -> None:
+    """The hash follows the text of its file, wherever that lies, and that of a base class in another file."""
+
+    def hash_of(text: str, base: str = "class Base: pass") -> str:
+        (desk / "mine.py").write_text(text)
+        (desk / "base.py").write_text(base)
+        for name in ("mine", "base"):
+            sys.modules.pop(name, None)
+        return load_policy("mine:Mine").source_hash
+
+    plain = GOOD.format(fields="")
+    child = plain.replace("class Mine", "from base import Base\nclass Mine(Base)")
+    first = hash_of(plain)
+    assert len(first) == 16 and hash_of(plain) == first
+    assert hash_of(plain + "# a word") != first
+    assert hash_of(child) != hash_of(child, "class Base: kept = 1")
+    (desk / "further").mkdir()
+    os.chdir(desk / "further")
+    assert load_policy("mine:Mine").source_hash == hash_of(child, "class Base: kept = 1")
+
+
+def test_every_policy_of_ours_has_its_own_hash() -> None:
+    """They are told apart by their files."""
+    assert all(load_policy(name).source_hash for name in POLICIES)
+    assert load_policy("route").source_hash != load_policy("orca").source_hash

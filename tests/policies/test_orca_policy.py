@@ -1,0 +1,165 @@
+"""The reference solver: what it makes of groups, of a hand, of those who walk at it; and every event, driven."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import NO_VEHICLES, Doing, People, RobotState, Signal, Vehicles
+from cosim.episode.driver import Driver
+from cosim.episode.ports import Observation, Privileged
+from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, foresee
+from cosim.policies.groups import distances, groups, lines
+from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
+from cosim.policies.route import crossing_limit
+from cosim.spec.events import GROUPS, Kind
+from cosim.spec.scenario import City, CrowdSpec
+
+CITY = City(seed=1, size_m=500.0)
+ROUTE = Polyline([(0.0, 0.0), (30.0, 0.0)])
+
+
+def people(*rows: tuple[float, float, float, float, Doing]) -> People:
+    """Of (x, y, heading, speed, doing)."""
+    xy = [row[:2] for row in rows]
+    ids = tuple(f"e{i}" for i in range(len(rows)))
+    return People.of(ids, xy, [r[2] for r in rows], [r[3] for r in rows], tuple(r[4] for r in rows))
+
+
+def known(others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7) -> Privileged:
+    """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
+    robot = RobotState(Pose(x_m, 0.0, 0.0), v_mps)
+    free = box(-2.0, -half_width_m, 40.0, half_width_m)
+    return Privileged(robot, ROUTE, x_m, others, NO_VEHICLES, {}, (), free)
+
+
+def test_talkers_are_one_group_and_passers_by_are_none() -> None:
+    """Two who talk 1.9 m apart and a third between whom and them the robot does not fit; one far off; one walking."""
+    crowd = people(
+        (10.0, 0.0, 0.0, 0.0, "talk"), (10.0, 1.9, 0.0, 0.0, "talk"), (10.0, 3.2, 0.0, 0.0, "stand"),
+        (10.0, -2.5, 0.0, 0.0, "stand"), (10.0, 0.9, 0.0, 1.2, "walk"),
+    )  # fmt: skip
+    assert groups(crowd) == [[0, 1, 2], [3]]
+    assert lines(crowd).shape == (4, 2, 2)
+    between = distances(np.array([[10.0, 1.0]]), lines(crowd))
+    assert between.min() < 1e-9
+
+
+def test_a_group_is_passed_round_on_the_side_with_room() -> None:
+    """Two talkers stand 1.5 m apart across the way, nearer to its left edge: the lane leads to the right of both."""
+    crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
+    scene = known(crowd)
+    lane_m = lane_past(scene, Way(ROUTE), scene.free, lines(crowd), 0.0)
+    assert lane_m <= -0.3 - 0.3 - 0.33 - 0.1
+
+
+def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
+    """Braking from afar, zero at 2 m, no limit by somebody who only stands."""
+    hand, nobody = people((12.0, 0.2, math.pi, 0.0, "stop")), people((12.0, 0.2, math.pi, 0.0, "stand"))
+    limits = [stop_limit(known(hand, x_m)) for x_m in (3.0, 6.0, 9.0, 9.9, 10.5)]
+    assert limits == sorted(limits, reverse=True) and limits[-1] == 0.0 and limits[0] > 2.0
+    assert stop_limit(known(nobody, 9.9)) == math.inf
+    driver = Driver(Orca())
+    x_m, v_mps = 3.0, 0.0
+    for tick in range(300):
+        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, known(hand, x_m, v_mps)))
+        v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
+        x_m += 0.1 * v_mps
+    assert v_mps == 0.0
+    assert 12.0 - x_m == pytest.approx(STOP_BEFORE_M, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("walk", "v_mps", "limit_mps"), [(False, 0.02, 0.0), (False, 1.2, math.inf), (True, 0.0, math.inf)]
+)
+def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
+    walk: bool, v_mps: float, limit_mps: float
+) -> None:
+    """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives on."""
+    here = replace(known(people(), 5.0, v_mps), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(walk, 30.0)})
+    assert crossing_limit(here) == limit_mps
+
+
+def test_foresight_turns_no_faster_than_the_robot() -> None:
+    """Every plan keeps to the yaw rate and the speed of the robot, and to its lane in the end."""
+    plans = Plans(np.array([0.0, 1.0, -1.0]), np.array([1.4, 1.4, 0.9]), np.full(3, 0.9), np.array([0.0, 0.0, 0.6]))
+    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2)))
+    turns = np.abs(np.diff(ahead.pose[..., 2], axis=0))
+    moved = np.hypot(*np.moveaxis(np.diff(ahead.pose[..., :2], axis=0), -1, 0))
+    assert turns.max() <= 0.65 * STEP_S + 1e-9 and moved.max() <= 1.4 * STEP_S + 1e-9
+    assert ahead.pose[-1, :, 1] == pytest.approx([0.0, 1.0, -1.0], abs=0.15)
+
+
+def test_somebody_who_walks_at_the_robot_is_foreseen_to_aim_at_it_and_then_to_commit() -> None:
+    """A robot that swerves early is followed; once they are COMMITS_M apart the walker keeps its line."""
+    plans = Plans(np.array([1.5]), np.array([1.0]), np.array([0.9]), np.array([0.0]))
+    start, walk = np.array([[14.0, 0.0]]), np.array([[-1.4, 0.0]])
+    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.0, 0.0), start, walk)
+    track = np.vstack([start, ahead.people[:, 0, 0]])
+    steps = np.diff(track, axis=0)
+    heading = np.arctan2(steps[:, 1], steps[:, 0])
+    apart = np.hypot(*(track[:STEPS] - np.vstack([[5.0, 0.0], ahead.pose[:-1, 0, :2]])).T)
+    assert np.ptp(np.unwrap(heading[apart < COMMITS_M - 0.6])) < 1e-9
+    assert np.ptp(np.unwrap(heading[apart > COMMITS_M])) > 0.05
+
+
+def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_half_a_metre() -> None:
+    """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every plan's way alike."""
+    plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
+    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2)))
+    for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
+        cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
+        scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
+        assert car_nearness(scene, ahead)[0] == pytest.approx(nearness)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [*((kind, 1) for kind in GROUPS), ("conversing", 2)],
+)
+def test_the_reference_solver_solves_every_event(kind: Kind, seed: int) -> None:
+    """One scenario of each event, with real engines: triggered, seen, its rule kept, its end reached."""
+    from cosim.place.walk_graph import WalkGraph
+    from scenarios.builders.reactive import build
+    from scenarios.execution.places import place
+    from scenarios.execution.run import episode
+
+    _, street_map = place(CITY)
+    whole = build(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
+    scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
+    record = episode(scenario, Orca()).record
+    assert (record.status, record.failures) == ("done", ())
+    assert record.measures["success"] == 1.0
+    assert record.ended == ("stop" if kind == "gesturing" else "goal")
+
+
+@pytest.mark.engine
+def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> None:
+    """Who does nothing about `frontal` collides with it."""
+    from cosim.core.state import Command
+    from cosim.episode.ports import Manifest
+    from cosim.place.walk_graph import WalkGraph
+    from scenarios.builders.reactive import build
+    from scenarios.execution.places import place
+    from scenarios.execution.run import episode
+
+    class Blind:
+        manifest = Manifest("blind", camera=None)
+
+        def reset(self, scenario_id: str, seed: int) -> None:
+            """Nothing to forget."""
+
+        def act(self, observation: Observation) -> Command:
+            return Command(1.2, 0.0)
+
+    _, street_map = place(CITY)
+    record = episode(build("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()).record
+    assert record.ended == "failure" and record.failures[0].other == "e0"

@@ -1,0 +1,198 @@
+"""`cosim look` and `cosim film` as a user runs them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+from pathlib import Path
+
+import av
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import RunError
+from cosim.episode.ports import Observation
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies.replay import Replay
+from cosim.records.record import Recorder
+from cosim.report.hud import Layout
+from cosim.report.video import Video
+from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
+from physics.cameras.eyes import WorldCamera
+from scenarios.viewing.film import Cut, robot_eye
+from tests.conftest import Cosim
+
+pytestmark = pytest.mark.engine
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
+    """A folder with a suite of one short scenario, and a run of it."""
+    from scenarios.builders.long_horizon import build
+    from scenarios.execution.places import place
+
+    folder = tmp_path_factory.mktemp("desk")
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
+    short = msgspec.structs.replace(
+        whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
+    )
+    write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
+    done = fresh_cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder
+
+
+def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim) -> None:
+    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play."""
+    words = ("film", "run", "t-0", "--from", "1", "--to", "2", "--size", "320x180", "-o", "film.mp4")
+    done = cosim(*words, cwd=desk)
+    assert done.returncode == 0, done.stderr
+    with av.open(str(desk / "film.mp4")) as film:
+        pictures = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
+    assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
+    assert not list(desk.glob("*.part"))
+
+
+def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
+    """--view puts another picture beside the same map, over the same bar."""
+    seen = []
+    for view in ("above", "robot"):
+        words = ("film", "run", "t-0", "--to", "0.1", "--size", "320x180", "--view", view, "-o", f"{view}.mp4")
+        done = cosim(*words, cwd=desk)
+        assert done.returncode == 0, done.stderr
+        with av.open(str(desk / f"{view}.mp4")) as film:
+            seen.append(next(film.decode(video=0)).to_ndarray(format="rgb24").astype(float))
+    layout = Layout.of(320, 180)
+    apart = np.abs(seen[0] - seen[1]).mean(axis=2)
+    assert apart[: layout.view.height, : layout.view.width].mean() > 15
+    assert apart[layout.map.y + 4 : layout.bar.y - 4, layout.map.x + 4 :].mean() < 3
+
+
+@pytest.mark.parametrize("size", [(320, 180), (1280, 720), (1024, 1024)])
+def test_the_robots_camera_sees_no_farther_aside_in_a_film(size: tuple[int, int]) -> None:
+    """Whatever the shape of its part of the film, the camera is as wide as at 4:3, or narrower."""
+    for view in ("follow", "robot"):
+        spec = robot_eye(Cut(size=size, view=view))  # type: ignore[arg-type]
+        aside = np.tan(np.radians(0.5 * spec.fov_deg)) * spec.width / spec.height
+        assert aside <= np.tan(np.radians(37.5)) * 4 / 3 + 1e-9 and spec.fov_deg <= 75.0 + 1e-9
+        assert aside > 0.5
+
+
+def test_a_film_of_the_beginning_is_not_simulated_to_the_end(
+    desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After the last picture nothing is simulated, and before the first nothing is drawn; it is said meanwhile."""
+    simulated, drawn = [], []
+    add, render = Recorder.add, WorldCamera.render
+    monkeypatch.setattr(Recorder, "add", lambda self, *told: simulated.append(add(self, *told)))
+    monkeypatch.setattr(WorldCamera, "render", lambda self, *told: drawn.append(0) or render(self, *told))
+    done = cosim("film", "run", "t-0", "--from", "0.5", "--to", "0.7", "--size", "320x180", "-o", "cut.mp4", cwd=desk)
+    assert done.returncode == 0, done.stderr
+    assert (len(simulated), len(drawn)) == (14, 4)
+    assert done.stderr.splitlines()[-2:] == ["simulating to 0.5 s ...", "filming t-0 ..."]
+    assert "of its first 0.7 s every tick is as recorded" in done.stdout
+
+
+@pytest.mark.parametrize("column", ["pose", "person_m", "reset_s_m"])
+def test_a_cut_that_is_not_as_recorded_is_no_film(desk: Path, cosim: Cosim, column: str) -> None:
+    """One bit of one tick of the trajectory: an error that names the moment, and no file; beyond the cut it is none."""
+    path = desk / "run" / "episodes" / "t-0" / "trajectory.npz"
+    kept = path.read_bytes()
+    with np.load(path) as arrays:
+        held = dict(arrays)
+    held[column] = held[column].copy()
+    held[column][5] = np.nextafter(held[column][5], 9e9) if column != "reset_s_m" else 1.0
+    np.savez(path, **held)
+    words = ("film", "run", "t-0", "--size", "320x180", "--speed", "4")
+    try:
+        until, beyond = (
+            cosim(*words, "--to", "0.2", "-o", "until.mp4", cwd=desk),
+            cosim(*words, "--to", "0.5", "-o", "beyond.mp4", cwd=desk),
+        )
+    finally:
+        path.write_bytes(kept)
+    assert until.returncode == 0 and (desk / "until.mp4").exists(), until.stderr
+    assert beyond.returncode == 2 and "not the same when it was replayed (from 0.25 s on)" in beyond.stderr
+    assert not list(desk.glob("beyond*"))
+    assert "of the same versions: of other code" in beyond.stderr
+
+
+def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None:
+    """A film of another episode than the recorded one is no film of it: an error, and no file."""
+    path = desk / "run" / "episodes" / "t-0" / "record.json"
+    kept = path.read_bytes()
+    record = json.loads(kept)
+    path.write_text(json.dumps(record | {"state_hash": "0" * len(record["state_hash"])}))
+    try:
+        done = cosim("film", "run", "t-0", "--from", "1.9", "--size", "320x180", "-o", "wrong.mp4", cwd=desk)
+    finally:
+        path.write_bytes(kept)
+    assert done.returncode == 2 and "not the same when it was replayed" in done.stderr
+    assert "of the same versions: of other code" in done.stderr
+    assert not list(desk.glob("wrong*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("film", "run", "t-9"), "unknown finished episode"),
+        (("film", "run", "t-0", "--from", "99"), "nothing to film"),
+        (("film", "run", "t-0", "--from", "1", "--to", "nan"), "give a later --to"),
+        (("film", "run", "t-0", "--size", "wide"), "--size 'wide'"),
+        (("film", "run", "t-0", "--size", "321x181"), "both sides must be even"),
+        (("film", "run", "t-0", "--size", "64x64"), "nothing can be read"),
+        (("film", "run", "t-0", "-o", "film.gif"), "ends in .mp4"),
+        (("film", "run", "t-0", "-o", "nowhere/film.mp4"), "cannot be written"),
+        (("film", "run", "t-0", "--view", "inside"), "unknown view"),
+        (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
+        (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
+        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 172, among them"),
+        (("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"), "use a name that ends in .png or .jpg"),
+        (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
+    ],
+)
+def test_what_cannot_be_shown_is_an_error_in_words(desk: Path, cosim: Cosim, words: tuple[str, ...], told: str) -> None:
+    """Exit code 2, or 3 where the machine does not write; one message, no traceback."""
+    done = cosim(*words, cwd=desk)
+    assert done.returncode == (3 if "written" in told else 2) and told in done.stderr and "Traceback" not in done.stderr
+    assert "starting" not in done.stderr or words[0] == "film"
+
+
+def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
+    """From the robot or from above: a picture of the size asked for, with something in it; what is done meanwhile is
+    said."""
+    seen = {}
+    for name, words in {
+        "start": ("--at", "0"),
+        "above": ("--at", "1", "--view", "above"),
+    }.items():
+        done = cosim("look", "t-0", "--suite", "tiny.json", *words, "--size", "160x90", "-o", f"{name}.png", cwd=desk)
+        assert done.returncode == 0, done.stderr
+        driven = ["simulating to 1 s"] if name == "above" else []
+        stages = ["choosing the camera", "reading the street map", "starting SUMO", *driven, "drawing"]
+        said = done.stderr.splitlines()
+        assert len(said) == len(stages) and all(map(str.startswith, said, stages))
+        seen[name] = cv2.imread(str(desk / f"{name}.png"))
+        assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
+    assert (seen["start"] != seen["above"]).mean() > 0.5
+
+
+def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
+    """An exception while it is made: no file, no part of one."""
+    with pytest.raises(KeyError), Video(tmp_path / "film.mp4", (64, 48), 20) as video:
+        video.add(np.zeros((48, 64, 3), dtype=np.uint8))
+        raise KeyError
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_replay_ends_with_its_record() -> None:
+    """Beyond the last recorded tick there is nothing to say."""
+    replay = Replay(np.array([[1.0, 0.2]]))
+    assert replay.act(Observation(0, 0.0, None, 0.0, 0.0)).w_radps == 0.2
+    with pytest.raises(RunError, match="ends after 1 ticks"):
+        replay.act(Observation(1, 0.05, None, 0.0, 0.0))

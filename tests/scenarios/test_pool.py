@@ -1,0 +1,231 @@
+"""Environment processes: those that cannot begin, die or say nothing, and what is told of them, once."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from multiprocessing import Pipe
+from pathlib import Path
+
+import pytest
+
+from cosim.core.errors import MachineError
+from cosim.episode.driver import Doing
+from cosim.policies.load import load_policy
+from cosim.records.record import Record
+from cosim.records.run_folder import RunFolder, RunSpec, read_records
+from cosim.spec.scenario import City, Scenario, Suite
+from scenarios.execution import pool
+from scenarios.execution.asked import Asked, Patience
+from scenarios.execution.messages import Done, Hello, Job, Message, Ready
+from scenarios.execution.shepherd import BoundedLog
+from tests.conftest import Cosim
+
+MODULES = {
+    "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or directory')",
+    "mine": """
+import os, sys, time
+from pathlib import Path
+from cosim.episode.ports import Manifest
+from cosim.core.state import STILL
+IN_A_WORKER = sys.argv[:1] == ["-c"]
+
+class Mine:
+    manifest = Manifest("mine", camera=None)
+    def reset(self, scenario_id, seed): pass
+    def act(self, observation): return STILL
+class Exits(Mine):
+    def __init__(self):
+        if IN_A_WORKER: sys.exit("no GPU left")
+class Dies(Mine):
+    def __init__(self):
+        if IN_A_WORKER: os._exit(7)
+class Hangs(Mine):
+    def __init__(self):
+        if IN_A_WORKER: time.sleep(3600)
+class Changes(Mine):
+    manifest = Manifest("mine", camera=None, version=str(os.getpid()))
+class Edits(Mine):
+    def __init__(self):
+        if IN_A_WORKER: Path(__file__).open("a").write("# edited")
+""",
+}
+CANNOT_BEGIN = {
+    "Exits": (2, "error: policy 'mine:Exits' cannot be made: SystemExit: no GPU left"),
+    "Dies": (2, "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit code 7"),
+    "Hangs": (2, "error: policy 'mine' gave no answer for 5 s while it was loaded in an environment process"),
+    "Changes": (2, "error: policy 'mine:Changes' has another manifest in each process"),
+    "Edits": (2, "error: policy 'mine:Edits' was edited while the run was going on: begin another run"),
+}
+
+
+@pytest.fixture
+def desk(tmp_path: Path) -> Path:
+    """A folder with the policies."""
+    (tmp_path / "mine.py").write_text(MODULES["mine"])
+    return tmp_path
+
+
+def run(cosim: Cosim, desk: Path, name: str) -> tuple[int, str]:
+    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", "5", "--out", "run")
+    said = cosim("run", "reactive", *words, cwd=desk)
+    assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
+    assert "crashed" not in said.stdout + said.stderr
+    return said.returncode, said.stderr
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", CANNOT_BEGIN)
+def test_a_policy_that_a_process_cannot_load_ends_the_run(cosim: Cosim, desk: Path, name: str) -> None:
+    """It was loaded when the run began, and is not in its processes: wrong use, once, and no episode has crashed."""
+    code, said = run(cosim, desk, name)
+    assert (code, said.count("error:")) == (2, 1) and CANNOT_BEGIN[name][1] in said
+
+
+@pytest.mark.engine
+def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk: Path) -> None:
+    """What a process lacks is told once, with the remedy."""
+    (desk / "libsumo.py").write_text(MODULES["libsumo"])
+    path = os.pathsep.join([str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))])
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("PYTHONPATH", path)
+        code, said = run(fresh_cosim, desk, "Mine")
+    assert (code, said.count("error:")) == (3, 1)
+    assert "an environment process cannot start: libX11.so.6: cannot open shared object" in said
+
+
+@pytest.mark.parametrize("printed", [0, 10, 100, 101, 150, 200, 201, 1000])
+def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> None:
+    """Short ones are whole; of longer ones the first and the last 100 bytes or more are kept, in order."""
+    text = bytes(i % 251 for i in range(printed))
+    with (tmp_path / "log").open("wb") as file:
+        log = BoundedLog(file.fileno(), first=100, last=100)
+        for start in range(0, printed, 30):
+            log.write(text[start : start + 30])
+        log.close()
+    kept = (tmp_path / "log").read_bytes()
+    if printed <= 200:
+        assert kept == text
+        return
+    first, gap, last = kept.partition(b" bytes were printed here and left out]\n")
+    first, _, left_out = first.rpartition(b"\n[")
+    assert text.startswith(first or kept) and text.endswith(last) and len(kept) < 300
+    assert not gap or (len(first), len(first) + int(left_out) + len(last)) == (100, printed)
+    assert not gap or 100 <= len(last) < 130
+
+
+@pytest.mark.parametrize(
+    ("doing", "answer_s", "start_s", "overdue"),
+    [
+        ("act", 0.0, 1e9, True),
+        ("act", 1e9, 0.0, False),
+        ("first act", 0.0, 1e9, False),
+        ("first act", 1e9, 0.0, True),
+        ("reset", 1e9, 0.0, True),
+        ("loading", 1e9, 0.0, True),
+    ],
+)
+def test_a_first_answer_may_take_longer(doing: Doing, answer_s: float, start_s: float, overdue: bool) -> None:
+    """What loads a model has a time of its own; nobody is late before anything is asked."""
+    asked = Asked.new()
+    assert asked.question is None
+    asked.starts(doing, 64)
+    time.sleep(0.001)
+    question = asked.question
+    assert question is not None and question.overdue(Patience(answer_s, start_s)) is overdue
+    assert question.when == ("act at 3.20 s" if "act" in doing else doing)
+    asked.stops()
+    assert asked.question is None
+    asked.close()
+
+
+class Fake:
+    """An environment process that says what a test has prepared, and then nothing; or it ends."""
+
+    def __init__(self, *messages: Message, asks: Doing | None = None, ends: bool = False) -> None:
+        self.pipe, self.theirs = Pipe()
+        self.asked, self.question = Asked.new(), None
+        self.log = Path("worker-0.log")
+        self.killed = False
+        if asks is not None:
+            self.asked.starts(asks, 64)
+        self._messages: list[Message | None] = [*messages, *([None] if ends else [])]
+
+    def send(self, message: Hello | Job) -> None:
+        """It does not listen."""
+
+    def messages(self) -> Iterator[Message | None]:
+        while self._messages:
+            yield self._messages.pop(0)
+
+    def hang_up(self) -> None:
+        self.pipe.close()
+
+    def kill(self, *, wait: bool = True) -> None:
+        self.killed = True
+        self.question = self.asked.question
+
+    def end(self) -> str:
+        self.question = self.asked.question
+        return "the environment process ended with exit code 7"
+
+
+SCENARIO = Scenario(
+    id="s-0", suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+    route=((0.0, 0.0), (9.0, 0.0)),
+)  # fmt: skip
+
+
+def pooled(monkeypatch: pytest.MonkeyPatch, folder: Path, *fakes: Fake, **named: float) -> Record:
+    """The record of one scenario, run by these processes, one after the other."""
+    waiting = iter(fakes)
+    monkeypatch.setattr(pool, "Process", lambda log: next(waiting))
+    monkeypatch.setattr(pool, "POLL_S", 0.0)
+    suite, driver = Suite(name="s", version="1", scenarios=(SCENARIO,)), load_policy("stop")
+    spec = RunSpec(
+        suite="s", suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
+        scenarios=("s-0",), versions={},
+    )  # fmt: skip
+    with RunFolder.create(folder / "run", spec, suite) as held:
+        patience = Patience(**named)
+        pool.run_all(held, suite.scenarios, "stop", driver, jobs=1, tell=lambda _: None, patience=patience)
+        assert next(waiting, None) is None and held.finished() == {"s-0"}
+    (record,) = read_records(folder / "run")
+    return record
+
+
+def test_an_engine_that_hangs_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A process that says nothing, while its policy has nothing to answer, is killed; the second time it is a crash."""
+    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    fakes = (Fake(Ready()), Fake(Ready()))
+    record = pooled(monkeypatch, tmp_path, *fakes)
+    assert record.reason.startswith("the environment process showed no sign of life, 2 times") and record.ticks == 0
+    assert all(fake.killed for fake in fakes)
+
+
+def test_a_policy_that_hangs_is_not_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It is told once, with the policy, the time, and where."""
+    record = pooled(monkeypatch, tmp_path, Fake(Ready(), asks="act"), answer_s=0.0)
+    assert record.reason == "policy 'stop' gave no answer for 0 s in act at 3.20 s of s-0"
+
+
+def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """While a policy has time left to answer, its process may say nothing for as long as it likes."""
+    monkeypatch.setattr(pool, "SILENCE_S", 0.0)
+    slow = Fake(Ready(), asks="act")
+    began = time.monotonic()
+    record = pooled(monkeypatch, tmp_path, slow, answer_s=0.2)
+    assert time.monotonic() - began > 0.2 and "gave no answer for 0.2 s" in record.reason
+
+
+def test_a_record_that_is_gone_is_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A process that reports an episode as done, of which there is no record, has not finished it."""
+    record = pooled(monkeypatch, tmp_path, Fake(Ready(), Done("s-0", "done")))
+    assert record.status == "crashed" and record.reason.startswith("its record was gone or damaged")
+
+
+def test_processes_that_never_come_up_end_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Twice in a row: the machine's fault, told with the log."""
+    with pytest.raises(MachineError, match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log"):
+        pooled(monkeypatch, tmp_path, Fake(ends=True), Fake(ends=True))

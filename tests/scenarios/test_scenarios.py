@@ -1,0 +1,312 @@
+"""One sweep over everything that is registered: a scenario is tested by existing."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, Point, Polygon, box
+
+from cosim.core.clock import Clock
+from cosim.core.errors import SpecError, UsageError
+from cosim.core.geometry import Polyline
+from cosim.core.state import NO_VEHICLES, NOBODY, RobotState
+from cosim.episode.control import Limits
+from cosim.episode.driver import Driver
+from cosim.episode.loop import query
+from cosim.episode.ports import Privileged
+from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, WalkableArea
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies import POLICIES
+from cosim.spec.events import Event, EventQuery
+from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
+from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
+from scenarios.builders.build import Proof
+from scenarios.builders.long_horizon import build, on_road_m
+from scenarios.builders.sample import suite_on_map, thinned
+from scenarios.catalog import SUITES, chosen, suite
+from scenarios.events import BEHAVIORS, react
+from sumo_nets.maps.mapstore import read_map
+
+LONG = suite("long-horizon").scenarios
+
+
+def test_the_long_horizon_suite_is_what_it_promises() -> None:
+    """At least ten scenarios in at least three cities, each longer than 100 m, each solved by the expert."""
+    whole = suite("long-horizon")
+    assert len(whole.scenarios) >= 10
+    assert len({s.place.name for s in whole.scenarios}) >= 3
+    for scenario in whole.scenarios:
+        assert scenario.route_line.length_m > 100.0
+        assert scenario.time_limit_s == max(300.0, scenario.route_line.length_m / 0.2)
+        assert scenario.crossings and scenario.place.net_hash
+
+
+def test_the_reactive_suite_is_what_it_promises() -> None:
+    """Each event in twenty cities, one each; 10 to 20 m of way; nothing triggers where the robot starts."""
+    whole = suite("reactive")
+    cities = {scenario.place.name for scenario in whole.scenarios}
+    assert len(cities) == 20
+    places = {kind: [s.place.name for s in whole.scenarios if s.events[0].kind == kind] for kind in BEHAVIORS}
+    assert all(len(there) == 20 and set(there) == cities for there in places.values())
+    assert [s.place.name for s in whole.scenarios] == sorted(
+        (s.place.name for s in whole.scenarios), key=lambda name: int(name.rpartition("-")[2])
+    )
+    for scenario in whole.scenarios:
+        (event,) = scenario.events
+        assert 10.0 <= scenario.route_line.length_m <= 20.5
+        assert scenario.ends_on_failure and (scenario.ends_at == "stop") == (event.kind == "gesturing")
+        assert 1.1 <= event.speed_mps <= 1.65
+        states = react(first_query(scenario)).states
+        assert states[0].phase == "waiting"
+        chord = Polyline([scenario.start[:2], scenario.goal])
+        assert max(abs(chord.project(x, y)[1]) for x, y in scenario.route) < 0.2
+
+
+def first_query(scenario: Scenario) -> EventQuery:
+    """What a director is asked at the first tick."""
+    return query(scenario, Clock(), 0, RobotState(scenario.start_pose), NOBODY, 0.0, (0.7, 0.55), ())
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_every_scenario_comes_with_its_proof(name: str) -> None:
+    """The proofs beside a suite are of these very scenarios."""
+    proofs = msgspec.json.decode(SUITES[name].with_suffix(".proof.json").read_bytes(), type=list[Proof])
+    assert {proof.scenario: proof.scenario_hash for proof in proofs} == {
+        s.id: content_hash(s) for s in suite(name).scenarios
+    }
+
+
+def test_scenarios_are_chosen_by_event() -> None:
+    """All with an event of the kinds asked for; a kind that is not there is answered with those that are."""
+    whole = suite("reactive")
+    assert {s.events[0].kind for s in chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
+    assert [s.events[0].kind for s in chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
+    with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
+        chosen(whole, kinds=["ambush"])
+
+
+def test_a_suite_survives_its_file(tmp_path: Path) -> None:
+    """Writing and reading a suite changes nothing, its hash included."""
+    whole = suite("long-horizon")
+    write_suite(whole, tmp_path / "s.json")
+    again = read_suite(tmp_path / "s.json")
+    assert again == whole and again.content_hash == whole.content_hash
+
+
+def test_a_place_says_how_rough_its_ground_is() -> None:
+    """Flat ground leaves a spec and its hash as they were; roughness survives the file; out of range is refused."""
+    flat, rough = City(seed=1, roughness=0.0), CityMap(map="m", roughness=0.4)
+    assert flat == City(seed=1) and b"roughness" not in msgspec.json.encode(flat)
+    assert flat.unevenness == 0.0 and rough.unevenness == 0.4
+    assert msgspec.json.decode(msgspec.json.encode(rough), type=CityMap) == rough
+    assert content_hash(rough) != content_hash(CityMap(map="m"))
+    for bad in (-0.1, 1.5, float("nan")):
+        with pytest.raises(SpecError, match=r"roughness is \S+, but it lies between 0 \(flat\) and 1"):
+            City(seed=1, roughness=bad)
+
+
+@pytest.mark.engine
+def test_roughness_can_be_asked_for_on_a_map_alone() -> None:
+    """`--roughness` goes into the scenarios' place; without `--map`, or out of range, it is refused with the reason."""
+    from typer.testing import CliRunner
+
+    from cosim.cli.app import app
+
+    for options, reason in (
+        (["--roughness", "0.3"], "--roughness goes with --map"),
+        (["--map", "anything", "--roughness", "2"], "roughness is 2, but it lies between 0"),
+    ):
+        refused = CliRunner().invoke(app, ["run", "long-horizon", *options])
+        assert refused.exit_code != 0 and reason in str(refused.exception)
+
+
+@pytest.mark.engine
+def test_fewer_people_walk_where_sidewalks_are_few() -> None:
+    """On a small map there are fewer people than in a city, and no more than were asked for where there is room."""
+    (scenario,) = suite_on_map("long-horizon", "sumo-fkk-in", 1, 1).scenarios
+    assert 20 <= scenario.crowd.persons <= 40
+    ten = msgspec.structs.replace(scenario.crowd, persons=10)
+    few = msgspec.structs.replace(scenario, crowd=ten)
+    assert thinned(few, read_map("sumo-fkk-in")) == few
+
+
+def test_free_space_ends_at_furniture() -> None:
+    """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
+    from physics.street.furniture import Prop, footprints
+    from scenarios.execution.assemble import clear_of
+
+    area = cross_map().walkable
+    post = Prop("prop:east:0", "lamp", 0, 20.0, 1.2, 0.0, 0)
+    beside = Prop("prop:east:1", "bench", 0, 20.0, 4.0, 0.0, 0)
+    assert clear_of(area, [beside]) is area and clear_of(area, []) is area
+    free = clear_of(area, [post, beside])
+    assert free.area == pytest.approx(area.area - footprints([post])[0].area)
+    assert not free.intersects(Point(20.0, 1.2))
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("scenario", LONG, ids=lambda s: s.id)
+def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
+    """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
+    from scenarios.execution.places import place
+
+    _, street_map = place(scenario.place)
+    route = scenario.route_line
+    near = shapely.buffer(LineString(scenario.route), 200.0)
+    free = fenced(street_map.walkable_near(near), scenario.barriers)
+    part = next(p for p in shapely.get_parts(free) if p.covers(Point(route.points[0])))
+    assert part.covers(Point(route.points[-1]))
+    assert not [ring for ring in part.interiors if shapely.Polygon(ring).area > 0.25]
+    assert shapely.covers(shapely.buffer(near, -1.0), part)
+    assert WalkableArea(shapely.buffer(part, -0.3)).signed_distance(route.resampled(0.25).points).min() >= 0.0
+    assert {e.kind for e in scenario.events} <= set(BEHAVIORS)
+    for event in scenario.events:
+        at = route.at(event.route_s_m)
+        assert np.hypot(at.x_m - event.x_m, at.y_m - event.y_m) < 0.01
+    for crossing in scenario.crossings:
+        middle = route.at((crossing.enter_s_m + crossing.leave_s_m) / 2)
+        strip = street_map.strips[crossing.id]
+        assert strip.polygon.covers(Point(middle[:2])) and strip.signalised == crossing.signalised
+
+
+def cross_map() -> StreetMap:
+    """Four sidewalks of 40 m that meet at a corner of 4 m x 4 m in the middle."""
+    arms = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
+    strips = {}
+    for name, (dx, dy) in arms.items():
+        line = np.array([[2.0 * dx, 2.0 * dy], [42.0 * dx, 42.0 * dy]])
+        polygon = shapely.buffer(LineString(line), 1.6, cap_style="flat")
+        strips[name] = Strip(name, "sidewalk", line, 3.2, polygon, ("middle", None))
+    corner = Corner("middle", box(-2, -2, 2, 2), tuple(Port(name, 0) for name in arms))
+    return StreetMap("cross", (-42, -42, 42, 42), strips, {"middle": corner}, {}, {})
+
+
+def test_branches_are_the_ports_a_way_does_not_use() -> None:
+    """On a crossroads from west to east, north and south are closed."""
+    way = [Port("west", 0), Port("east", 0)]
+    assert branches(cross_map(), way) == [Port("north", 0), Port("south", 0)]
+
+
+def test_the_proof_refuses_an_open_branch_and_a_closed_way() -> None:
+    """Fences at every branch prove the path; a missing one and one across the way are refused with the reason."""
+    street_map = cross_map()
+    way = [Port("west", 0), Port("east", 0)]
+    route = Polyline([(-30, 0), (30, 0)])
+    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    part = prove_single_path(street_map, route, fences, way, 0.3)
+    assert part.covers(Point(30, 0)) and not part.covers(Point(0, 30))
+    across = barrier_at(street_map, Port("east", 0))
+    with pytest.raises(SpecError, match="start and goal are not connected"):
+        prove_single_path(street_map, route, [*fences, across], way, 0.3)
+    with pytest.raises(SpecError, match=r"nearer than 1\.70 m|narrower than 3\.40 m"):
+        prove_single_path(street_map, route, fences, way, 1.7)
+
+
+def test_the_proof_refuses_a_way_round_an_island() -> None:
+    """A hole in the walkable area leaves two ways: refused, and the place is named."""
+    street_map = cross_map()
+    island = box(-0.4, -0.4, 0.6, 0.6)
+    holed = Corner("middle", box(-2, -2, 2, 2).difference(island), street_map.corners["middle"].ports)
+    street_map = StreetMap("island", street_map.bounds, street_map.strips, {"middle": holed}, {}, {})
+    way = [Port("west", 0), Port("east", 0)]
+    fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
+    with pytest.raises(SpecError, match=r"two ways remain: they lead round \(0\.1, 0\.1\)"):
+        prove_single_path(street_map, Polyline([(-30, 0), (30, 0)]), fences, way, 0.2)
+
+
+def test_a_fence_closes_its_whole_strip() -> None:
+    """Each port's fence cuts its strip from its corner."""
+    street_map = cross_map()
+    for name in street_map.strips:
+        free = fenced(street_map.walkable, [barrier_at(street_map, Port(name, 0))])
+        far = Point(street_map.strips[name].line[-1] * 0.9)
+        part = next(p for p in shapely.get_parts(free) if p.covers(far))
+        assert not part.covers(Point(0, 0))
+
+
+def test_a_slanting_fence_closes_a_crossing_that_meets_its_corner_at_an_angle() -> None:
+    """Where a corner reaches round the end of a crossing a square fence leaves a way past it, a slanting one none."""
+    street_map = cross_map()
+    slanting = Corner("middle", Polygon([(-2, -2), (2, -2), (2, 6), (-2, 2)]), street_map.corners["middle"].ports)
+    north = dataclasses.replace(street_map.strips["north"], kind="crossing")
+    strips = {**street_map.strips, "north": north}
+    street_map = StreetMap("slant", street_map.bounds, strips, {"middle": slanting}, {}, {})
+    far = Point(0, 40)
+
+    def reached(fence: Barrier) -> bool:
+        free = fenced(street_map.walkable, [fence])
+        return any(part.covers(far) and part.covers(Point(0, -1)) for part in shapely.get_parts(free))
+
+    assert reached(barrier_at(street_map, Port("north", 0)))
+    assert not reached(barrier_at(street_map, Port("north", 0), slanting=True))
+
+
+def test_a_route_on_a_carriageway_is_measured() -> None:
+    """20 m of a route lie on a lane that is drawn over its sidewalk; those of a crossing do not count."""
+    line = np.array([[10.0, 0.0], [30.0, 0.0]])
+    lane = Lane("car_0", "car", "road", line, 3.0, shapely.buffer(LineString(line), 1.5, cap_style="flat"))
+    street_map = dataclasses.replace(cross_map(), lanes={"car_0": lane})
+    route = Polyline([(-30, 0), (38, 0)])
+    assert on_road_m(street_map, route, ()) == pytest.approx(20.0, abs=1.0)
+    crossing = RouteCrossing(id="c", enter_s_m=50.0, leave_s_m=60.0, signalised=False)
+    assert on_road_m(street_map, route, [crossing]) == pytest.approx(9.0, abs=1.0)
+    assert on_road_m(cross_map(), route, ()) == 0.0
+
+
+@pytest.mark.engine
+def test_routes_keep_off_stairs_and_bridges() -> None:
+    """A map with routes has none left when every way is one of stairs."""
+    where = CityMap(map="sumo-fkk-in")
+    street_map = read_map(where)
+    assert build(where, street_map, WalkGraph(street_map), 0, "plain").crossings
+    steps = {name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()}
+    street_map = dataclasses.replace(street_map, strips=steps)
+    with pytest.raises(SpecError) as caught:
+        build(where, street_map, WalkGraph(street_map), 0, "stairs")
+    said = str(caught.value)
+    assert "the way leads over stairs, a bridge or a tunnel (" in said and "\n" not in said
+    assert "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import another area" in said
+
+
+@pytest.mark.parametrize("name", POLICIES)
+def test_every_policy_answers_within_its_manifest(name: str) -> None:
+    """Every shipped policy resets, acts and stays within the robot's limits on an empty street."""
+    from cosim.episode.ports import Observation
+
+    driver, limits = Driver(POLICIES[name]()), Limits()
+    Clock.for_rate(driver.manifest.rate_hz)
+    route = Polyline([(0, 0), (50, 0)])
+    driver.reset("t", 0)
+    for tick in range(0, 200, 2):
+        robot = RobotState(route.at(tick * 0.05), 1.0)
+        known = Privileged(robot, route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2))
+        command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, known))
+        assert 0.0 <= command.v_mps <= limits.v_mps and abs(command.w_radps) <= limits.w_radps
+
+
+def test_the_walking_graph_agrees_with_the_branches() -> None:
+    """With its branches closed, a way is the only one: the graph reaches nothing else."""
+    street_map = cross_map()
+    graph = WalkGraph(street_map)
+    closed = frozenset(branches(street_map, [Port("west", 0), Port("east", 0)]))
+    reach = graph.reach(Port("west", 1), closed)
+    assert {p.strip for p in reach.ports if np.isfinite(reach.to(p))} == {"west", "east"}
+    assert all(a != b for a, b in itertools.combinations(closed, 2))
+
+
+def test_two_pedestrians_of_one_name_are_refused() -> None:
+    """The second of a group "e0" is "e0-1": no other event may be called so."""
+    one = suite("reactive").scenarios[0]
+    two = [
+        Event(id=name, kind="queueing", x_m=0, y_m=0, heading_rad=0, route_s_m=5, half_width_m=2, people=2)
+        for name in ("e0", "e0-1")
+    ]
+    assert len(msgspec.structs.replace(one, events=(two[0],)).events[0].names) == 2
+    with pytest.raises(SpecError, match="two events have a pedestrian 'e0-1': give one another id"):
+        Scenario(**msgspec.structs.asdict(one) | {"events": tuple(two)})

@@ -1,0 +1,198 @@
+"""Event pedestrians and guests among people: they see the crowd and each other, and go round them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from cosim.core.state import NOBODY, People
+from cosim.people.neighbours import bystanders
+from cosim.spec.events import Bystander, Event, EventQuery, EventReply, EventState, Kind
+from cosim.spec.injection import Injected, Injection
+from scenarios.events import react
+from scenarios.events.guest import actor_of, advanced, arriving
+
+TICK_MS = 50
+PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
+BOX_M = (0.35, 0.275)
+
+
+def event(kind: Kind, **fields: object) -> Event:
+    """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
+    known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
+    known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
+    known |= {"half_length_m": 5.0} if kind == "ped_crossing" else {}
+    return Event(**known | fields)  # type: ignore[arg-type]
+
+
+def asked(
+    tick: int,
+    x_m: float,
+    v_mps: float,
+    seen: tuple[Bystander, ...],
+    events: tuple[Event, ...] = (),
+    *states: EventState,
+) -> EventQuery:
+    """The question of a robot at `x_m` on the x axis that faces +x."""
+    return EventQuery(
+        episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=v_mps,
+        robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=events, states=states,
+        bystanders=seen,
+    )  # fmt: skip
+
+
+def drive(
+    one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: Bystander
+) -> list[tuple[float, EventReply]]:
+    """(robot x, reply) at every tick of a robot that drives along the x axis, among people who walk straight on."""
+    states: tuple[EventState, ...] = ()
+    out = []
+    for tick in range(ticks):
+        t_s = tick * TICK_MS / 1000
+        here = tuple(Bystander(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps) for c in crowd)
+        reply = react(asked(tick, start_m + speed_mps * t_s, speed_mps, here, (one,), *states))
+        states = reply.states
+        out.append((start_m + speed_mps * t_s, reply))
+    return out
+
+
+def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
+    """Between the disk of a person and the outline of the robot."""
+    away = np.maximum(np.abs([x_m - robot_x_m, y_m]) - BOX_M, 0.0)
+    return float(np.hypot(*away)) - 0.3
+
+
+@pytest.mark.parametrize("kind", get_args(Kind))
+def test_people_who_are_in_nobodys_way_change_nothing(kind: Kind) -> None:
+    """To the bit: with somebody who stands off the sidewalk, and without."""
+    alone = drive(event(kind), 600, 1.0, 25.0)
+    assert drive(event(kind), 600, 1.0, 25.0, Bystander("c1", 50.0, 9.0, 0.0, 0.0)) == alone
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize(
+    ("kind", "people"),
+    [("conversing", 2), ("conversing", 3), ("conversing", 4), ("queueing", 3), ("queueing", 5), ("ped_crossing", 4)],
+)
+def test_the_people_of_an_event_do_not_walk_through_each_other(kind: Kind, people: int, side: int) -> None:
+    """Stepping to their places, back, and over a crosswalk; in the end everybody is where it belongs."""
+    track = drive(event(kind, people=people, side=side, hold_s=8.0), 900, 0.3, 39.0)
+    for _, reply in track:
+        places = [(w.x_m, w.y_m) for w in reply.states[0].walkers]
+        assert min(math.dist(a, b) for a, b in itertools.combinations(places, 2)) > 0.4
+    if kind != "ped_crossing":
+        first, last = track[0][1].states[0], track[-1][1].states[0]
+        assert last.phase == "over"
+        assert [(w.x_m, w.y_m) for w in last.walkers] == [(w.x_m, w.y_m) for w in first.walkers]
+
+
+def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walked_up_to() -> None:
+    """`obstructing` ends in the middle of the sidewalk all the same."""
+    for x_m, y_m, least in ((50.0, 0.9, 0.54), (50.0, 0.0, -1.0)):
+        track = drive(event("obstructing"), 200, 0.5, 40.0, Bystander("c1", x_m, y_m, 0.0, 0.0))
+        ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
+        assert ways[-1] == (50.0, 0.0)
+        assert min(math.dist(xy, (x_m, y_m)) for xy in ways) > least
+
+
+@pytest.mark.parametrize("y_m", [0.0, 0.2, -0.2])
+def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m: float) -> None:
+    """Somebody stands on its line, somebody comes towards it: it passes both, no faster than told, and meets the robot
+    that stands."""
+    crowd = (Bystander("c1", 44.0, y_m, 0.0, 0.0), Bystander("c2", 34.0, y_m, 1.1, 0.0))
+    track = drive(event("frontal"), 500, 0.0, 31.0, *crowd)
+    ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track if r.states[0].phase == "acting"]
+    assert min(math.dist(xy, (44.0, y_m)) for xy in ways) > 0.55
+    assert min(math.dist(xy, (34.0 + 1.1 * 0.05 * k, y_m)) for k, xy in enumerate(ways)) > 0.5
+    assert max(math.dist(a, b) for a, b in itertools.pairwise(ways)) < 1.2 * 0.05 + 1e-9
+    assert min(gap_m(31.0, *xy) for xy in ways) < 0.02
+
+
+@pytest.mark.parametrize("side", [-1, 1])
+def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side: int) -> None:
+    """Somebody stands on its line: it steps round, and takes aim anew at a robot that keeps its velocity."""
+    track = drive(event("lateral", side=side), 400, 0.8, 40.0, Bystander("c1", 50.1, side * 0.9, 0.0, 0.0))
+    acting = [(x, r.states[0].walkers[0]) for x, r in track if r.states[0].phase == "acting"]
+    assert min(math.dist((w.x_m, w.y_m), (50.1, side * 0.9)) for _, w in acting) > 0.5
+    assert min(gap_m(x, w.x_m, w.y_m) for x, w in acting) < 0.02
+    assert max(math.hypot(w.vx_mps, w.vy_mps) for _, w in acting) < 2.0 + 1e-9
+
+
+def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
+    """Behind somebody who walks slowly on its side it swerves, passes and comes in ahead of the robot."""
+    slow = Bystander("c1", 52.0, 1.6, 0.6, 0.0)
+    track = drive(event("overtaking"), 500, 1.0, 45.0, slow)
+    ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
+    assert min(math.dist(xy, (52.0 + 0.6 * 0.05 * k, 1.6)) for k, xy in enumerate(ways)) > 0.5
+    assert track[-1][1].states[0].phase in ("over", "gone")
+
+
+def test_a_guest_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
+    """On a way of 10 m somebody stands halfway, and somebody else at the end."""
+    guest = arriving(Injected(tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)))
+    standing = (Bystander("c1", 5.0, 5.0, 0.0, 0.0), Bystander("c2", 10.0, 5.0, 0.0, 0.0))
+    ways = []
+    for tick in range(400):
+        me = Bystander("ei-anna", guest.walker.x_m, guest.walker.y_m, guest.walker.vx_mps, guest.walker.vy_mps)
+        after = advanced(guest, asked(tick, 90.0, 0.0, (*standing, me)))
+        assert after is not None
+        guest = after
+        ways.append((guest.walker.x_m, guest.walker.y_m))
+    assert all(math.dist(xy, (c.x_m, c.y_m)) > 0.55 for xy in ways for c in standing)
+    assert guest.arrived_tick is not None and math.dist(ways[-1], (10.0, 5.0)) < 1.0
+    assert actor_of(guest, TICK_MS).speed_mps == 0.0
+
+
+@pytest.mark.parametrize("names", ["ab", "ba", "abc"])
+def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None:
+    """With the same path they are not in each other after a second, nor ever again before they arrive."""
+    path = ((0.0, 5.0), (10.0, 5.0))
+    guests = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
+    for tick in range(120):
+        seen = tuple(
+            Bystander(f"ei-{g.injection.id}", g.walker.x_m, g.walker.y_m, g.walker.vx_mps, g.walker.vy_mps)
+            for g in guests
+        )
+        after = [advanced(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
+        guests = [guest for guest in after if guest is not None]
+        places = [(g.walker.x_m, g.walker.y_m) for g in guests]
+        gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
+        assert len(guests) == len(names) and (tick < 20 or min(gaps) > 0.4)
+
+
+def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
+    """Of a crowd, one 3 m from an event pedestrian and a guest beside it; nobody while there is no event pedestrian."""
+    ids = ("c0", "c1", "e0", "e0-1", "ei-anna")
+    xy = [(3.0, 0.0), (9.0, 0.0), (0.0, 0.0), (0.0, 1.0), (-2.0, 0.0)]
+    people = People.of(ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5)
+    told = bystanders(people, [event("conversing", people=2)])
+    assert [(b.id, b.x_m, b.y_m) for b in told] == [("c0", 3.0, 0.0), ("ei-anna", -2.0, 0.0)]
+    assert [(b.vx_mps, b.vy_mps) for b in told] == [pytest.approx((0.0, 1.0)), pytest.approx((0.0, 0.5))]
+    crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
+    assert bystanders(crowd, [event("conversing")]) == bystanders(NOBODY, []) == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "people", "side", "standing"),
+    [
+        ("queueing", 5, -1, [(51.16, 0.18), (52.06, -0.54)]),
+        ("conversing", 3, -1, [(53.27, 1.28), (47.61, 0.54)]),
+        ("gesturing", 1, 1, [(50.31, 0.35), (47.0, 1.5)]),
+        ("obstructing", 1, 1, [(50.0, 0.5), (50.5, 0.3), (49.5, 0.3), (49.8, -0.4), (50.3, -0.4)]),
+    ],
+)
+def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
+    kind: Kind, people: int, side: int, standing: list[tuple[float, float]]
+) -> None:
+    """Where people stand in the way and close to the places, everybody is there within 8 s and stays."""
+    crowd = [Bystander(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
+    track = drive(event(kind, people=people, side=side), 300, 0.1, 40.0, *crowd)
+    late, last = track[160][1].states[0], track[-1][1].states[0]
+    assert (late.phase, last.phase) == ("acting", "acting")
+    assert [(w.x_m, w.y_m) for w in late.walkers] == [(w.x_m, w.y_m) for w in last.walkers]
+    alone = drive(event(kind, people=people, side=side), 300, 0.1, 40.0)[-1][1].states[0]
+    assert [(w.x_m, w.y_m) for w in last.walkers] == [(w.x_m, w.y_m) for w in alone.walkers]

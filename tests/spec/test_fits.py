@@ -1,0 +1,147 @@
+"""Whether scenarios fit their places: on a crossroads drawn by hand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, box
+
+from cosim.core.errors import SpecError
+from cosim.place.street_map import Corner, Port, StreetMap, Strip
+from cosim.spec.events import Event
+from cosim.spec.scenario import Barrier, City, CrowdSpec, Light, RouteCrossing, Scenario, Suite
+from scenarios.builders import fits
+from scenarios.builders.fits import check_places, misfits
+
+
+def crossroads() -> StreetMap:
+    """Sidewalks of 3.2 m x 40 m to the west and the north of a corner of 4 m x 4 m, a crossing to the east."""
+    arms = {"east": (1, 0), "north": (0, 1), "west": (-1, 0)}
+    strips = {}
+    for name, (dx, dy) in arms.items():
+        line = np.array([[2.0 * dx, 2.0 * dy], [42.0 * dx, 42.0 * dy]])
+        polygon = shapely.buffer(LineString(line), 1.6, cap_style="flat")
+        kind: Any = "crossing" if name == "east" else "sidewalk"
+        strips[name] = Strip(name, kind, line, 3.2, polygon, ("middle", None), signalised=name == "east")
+    corner = Corner("middle", box(-2, -2, 2, 2), tuple(Port(name, 0) for name in arms))
+    return StreetMap("cross", (-42, -42, 42, 42), strips, {"middle": corner}, {}, {})
+
+
+def event(**changes: Any) -> Event:
+    at: dict[str, Any] = {"x_m": -10.0, "y_m": 0.0, "route_s_m": 20.0}
+    return Event(id="e0", kind="obstructing", heading_rad=0.0, half_width_m=1.6, **at | changes)
+
+
+def barrier(**changes: Any) -> Barrier:
+    at: dict[str, Any] = {"x_m": 0.0, "y_m": 3.0, "heading_rad": 1.5708, "length_m": 3.4, "strip": "north", "end": 0}
+    return Barrier(**at | changes)
+
+
+def from_west_to_east(**changes: Any) -> Scenario:
+    """60 m along the sidewalk and over the crossing, the north closed, somebody standing on the way."""
+    fields: dict[str, Any] = {
+        "route": ((-30.0, 0.0), (0.0, 0.0), (30.0, 0.0)),
+        "crossings": (RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=True),),
+        "barriers": (barrier(),),
+        "events": (event(),),
+    }
+    fields |= changes
+    route = fields["route"]
+    return Scenario(id="s", suite="t", place=City(seed=1), seed=1, start=(*route[0], 0.0), goal=route[-1], **fields)
+
+
+def test_what_fits_is_not_spoken_of() -> None:
+    """A way on the sidewalk and over the crossing, its barrier where it closes a branch, its event on the way."""
+    assert list(misfits([from_west_to_east()], crossroads())) == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        (
+            {"route": ((-30.0, 1.8), (0.0, 0.0), (30.0, 0.0))},
+            "start is off the walkable area at (-30.00, 1.80), 0.0 m along the route",
+        ),
+        (
+            {"route": ((-30.0, 0.0), (-15.0, 3.2), (0.0, 0.0), (30.0, 0.0))},
+            "route is off the walkable area at (-22.15, 1.67), 8.0 m along the route",
+        ),
+        ({"events": (event(y_m=9.0),)}, "event 'e0' is off the walkable area at (-10.00, 9.00)"),
+        ({"barriers": (barrier(strip="south"),)}, "barriers[0].strip 'south' is none of map 'cross'"),
+        (
+            {"barriers": (barrier(), barrier(x_m=30.0, y_m=0.0, heading_rad=0.0, length_m=0.2))},
+            "barriers[1] stands 28 m from strip 'north', which it should close",
+        ),
+        (
+            {"barriers": (barrier(x_m=-10.0, y_m=0.0, heading_rad=0.0, strip="west"),)},
+            "barriers[0] on strip 'west' stands across the route",
+        ),
+        (
+            {"crossings": (RouteCrossing(id="west", enter_s_m=1.0, leave_s_m=28.0, signalised=False),)},
+            "crossing 'west' is none of map 'cross'",
+        ),
+        (
+            {"crossings": (RouteCrossing(id="east", enter_s_m=32.0, leave_s_m=60.0, signalised=False),)},
+            "crossing 'east': signalised is True on the map, not False",
+        ),
+        (
+            {"crossings": (RouteCrossing(id="east", enter_s_m=2.0, leave_s_m=20.0, signalised=True),)},
+            "crossing 'east' is not where the route is from enter_s_m to leave_s_m",
+        ),
+    ],
+    ids=[
+        "start-off", "route-off", "event-off", "unknown-strip", "far-barrier", "barrier-across", "no-crossing",
+        "other-signal", "crossing-elsewhere",
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:
+    """Field, number or id, and where it is."""
+    assert list(misfits([from_west_to_east(**changes)], crossroads())) == [f"scenario 's': {told}"]
+
+
+def test_a_density_makes_no_more_people_than_may_be_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """How many it makes is known where the map is: 400 m2 hold 60 people at 150 per 1000 m2."""
+    monkeypatch.setattr(fits, "MOST_PERSONS", 59)
+    dense = from_west_to_east(crowd=CrowdSpec(density=150.0))
+    assert list(misfits([dense], crossroads())) == [
+        "scenario 's': crowd density 150 within 80 m of the start makes 60 persons, and at most 59 can be had: "
+        "lower density or radius_m"
+    ]
+
+
+def test_a_scenario_far_from_everything_is_not_on_the_map() -> None:
+    """One message, however much of it is off."""
+    far = from_west_to_east(route=((5000.0, 0.0), (5060.0, 0.0)), crossings=(), barriers=(), events=())
+    assert list(misfits([far], crossroads())) == ["scenario 's': start (5000.0, 0.0) is not on map 'cross'"]
+
+
+def test_every_place_is_looked_at_once_and_all_is_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many scenarios a place has, in whatever order; a robot or a sky that is not there is told once."""
+    made = []
+
+    def place(where: City) -> tuple[None, StreetMap]:
+        made.append(where.seed)
+        return None, crossroads()
+
+    monkeypatch.setattr(fits, "place", place)
+    fine = from_west_to_east()
+    odd = from_west_to_east(robot="tank", light=Light(hdri="nowhere.hdr"), events=(event(y_m=9.0),))
+    scenarios = tuple(
+        msgspec.structs.replace(one, id=f"{name}-{i}", place=City(seed=seed))
+        for i in range(3)
+        for name, one, seed in (("fine", fine, 1), ("odd", odd, 2))
+    )
+    whole = Suite(name="w", version="1", scenarios=scenarios)
+    with pytest.raises(SpecError) as told:
+        check_places(whole, scenarios)
+    assert made == [1, 2]
+    head, *faults = str(told.value).splitlines()
+    assert head == "suite 'w': 5 faults:"
+    assert "unknown robot 'tank'. Valid choices: courier" in faults[0]
+    assert "hdri 'nowhere.hdr' does not exist" in faults[1]
+    assert all(f"scenario 'odd-{i}': event 'e0' is off" in faults[2 + i] for i in range(3))
+    check_places(whole, [s for s in scenarios if s.id.startswith("fine")])

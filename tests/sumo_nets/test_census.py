@@ -1,0 +1,173 @@
+"""The census of cities, properties of the generator over seeds and sizes, city folders and their command line."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from cosim.cli.app import app
+from cosim.core.errors import MapError, SpecError
+from cosim.place.street_map import WalkableArea
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.scenario import City
+from sumo_nets.city.census import BLOCKS, ZONES, _shape, census, clear_width_m, longest_walk_m
+from sumo_nets.city.city import STYLES
+from sumo_nets.city.seeds import SEEDS, shipped_cities
+from sumo_nets.city.signals import signal_faults
+from sumo_nets.city.store import build_city, city_net, is_whole, write_city
+from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.netfile import read_net
+
+pytestmark = pytest.mark.engine
+
+
+@pytest.fixture(scope="module")
+def large(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The net of a shipped city."""
+    path = tmp_path_factory.mktemp("large") / "city.net.xml"
+    build_city(shipped_cities(1)[0], path)
+    return path
+
+
+def test_a_shipped_city_keeps_every_promise(large: Path) -> None:
+    """Seven blocks, five zones on every street, one piece, room to pass, long walks, islands, driveways, no fault."""
+    found = census(large)
+    assert found.faults == ()
+    assert list(found.blocks) == list(BLOCKS) and min(found.blocks.values()) >= 2
+    assert list(found.zones) == list(ZONES) and found.missing == 0
+    assert found.one_piece >= 0.99 and found.clear_m >= 1.2 and found.longest_m >= 1500.0
+    assert min(found.crosswalks, found.refuges, found.driveways, found.signals) > 40
+    assert all(span.low < span.high for span in found.zones.values())
+
+
+def test_census_notices_what_is_broken(tmp_path: Path) -> None:
+    """Zones that are not there, passages too narrow, signals that never let people go: each is a fault."""
+    broken = tmp_path / "broken.net.xml"
+    build_city(City(seed=2, size_m=500.0), broken)
+    net = broken.read_bytes()
+    assert census(broken).faults == ()
+    broken.write_bytes(net.replace(b'key="frontage_m"', b'key="other"').replace(b'G"/>', b'r"/>'))
+    faults = census(broken).faults
+    assert any("without all of the zones" in fault for fault in faults)
+    assert any("never changes between walk and stop" in fault for fault in faults)
+    broken.write_bytes(net.replace(b'width="3.20"', b'width="1.10"').replace(b'width="1.92"', b'width="1.10"'))
+    assert any("a passage is only 1." in fault for fault in census(broken).faults)
+
+
+def test_streets_are_told_apart_by_their_turns() -> None:
+    """A line without turns is straight, one that turns one way a curve, one that turns both ways an S-bend."""
+    x = np.linspace(0.0, 100.0, 30)
+    assert _shape(np.column_stack([x, 0.02 * x])) == "straight"
+    assert _shape(np.column_stack([x, 0.004 * x * x])) == "curve"
+    assert _shape(np.column_stack([x, 12.0 * np.sin(x / 16.0)])) == "s_bend"
+
+
+def test_shipped_seeds_are_a_hundred_different_ones() -> None:
+    """The list of seeds is long and without repeats; cities have names of their own."""
+    assert len(SEEDS) == len(set(SEEDS)) == 100
+    assert len({city.name for city in shipped_cities()}) == 100
+
+
+@settings(max_examples=5)
+@given(
+    seed=st.integers(0, 2**31),
+    size_m=st.floats(200.0, 1200.0).map(lambda size: round(size, 1)),
+    style=st.sampled_from(sorted(STYLES)),
+)
+def test_any_city_is_whole(tmp_path_factory: pytest.TempPathFactory, seed: int, size_m: float, style: str) -> None:
+    """Any seed, size and style: one component, every strip reached, clear width, signals without fault, same bytes."""
+    folder = tmp_path_factory.mktemp("any")
+    one, two = folder / "one.net.xml", folder / "two.net.xml"
+    city = City(seed=seed, size_m=size_m, style=style)
+    build_city(city, one)
+    build_city(city, two)
+    assert one.read_bytes() == two.read_bytes()
+    assert signal_faults(one.read_bytes()) == []
+    place = read_net(one)
+    assert all(None not in strip.corners for strip in place.strips.values())
+    graph = WalkGraph(place)
+    assert set(graph.component) == {0}
+    assert clear_width_m(place) >= 1.2
+    assert longest_walk_m(graph) > 0.8 * size_m
+
+
+def test_a_city_folder_is_equal_when_made_again(tmp_path: Path) -> None:
+    """The net and what it was made from, byte by byte; nothing is overwritten or left behind by mistake."""
+    city = City(seed=4, size_m=260.0)
+    made = [write_city(city, tmp_path / name) for name in ("a", "b")]
+    assert made[0] == made[1] and made[0].net_hash == net_content_hash(tmp_path / "a" / "city.net.xml")
+    for name in ("city.net.xml", "city.json"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    assert sorted(p.name for p in (tmp_path / "a").iterdir()) == ["city.json", "city.net.xml"]
+    with pytest.raises(MapError, match="is not a city's folder"):
+        write_city(city, tmp_path)
+    with pytest.raises(SpecError, match="size_m must be"):
+        write_city(City(seed=4, size_m=20.0), tmp_path / "c")
+    assert not (tmp_path / "c").exists()
+
+
+@pytest.mark.parametrize(
+    "damage", [lambda b: b[:-1], lambda b: b[: len(b) // 2], lambda b: b"", lambda b: b[:9] + b"!" + b[10:]]
+)
+def test_a_damaged_net_in_the_cache_is_built_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, damage: Callable[[bytes], bytes]
+) -> None:
+    """Truncated, emptied or altered files in the cache are noticed and replaced."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    city = City(seed=9, size_m=200.0)
+    path = city_net(city)
+    whole = path.read_bytes()
+    path.write_bytes(damage(whole))
+    assert not is_whole(path)
+    assert city_net(city).read_bytes() == whole
+
+
+def _built(folder: str) -> tuple[str, int]:
+    os.environ["COSIM_CACHE"] = folder
+    path = city_net(City(seed=8, size_m=300.0))
+    return path.name, len(path.read_bytes())
+
+
+def test_processes_may_build_one_city_at_once(tmp_path: Path) -> None:
+    """Three processes ask for the same city together: one whole file is left, and nothing else."""
+    with multiprocessing.get_context("spawn").Pool(3) as pool:
+        names = pool.map(_built, [str(tmp_path)] * 3)
+    assert len(set(names)) == 1
+    assert [path.name for path in tmp_path.iterdir()] == [names[0][0]]
+    assert is_whole(tmp_path / names[0][0])
+
+
+def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """make, table and draw do what they say; bad input ends in a message."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
+    runner = CliRunner()
+    made = runner.invoke(app, ["city", "make", "--seed", "3", "--size", "250", str(tmp_path / "c")])
+    assert made.exit_code == 0 and (tmp_path / "c" / "city.json").exists()
+    shown = runner.invoke(app, ["city", "table", "--count", "2", "--size", "300"])
+    assert shown.exit_code == 0 and "2 cities" in shown.output and "frontage" in shown.output
+    drawn = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "c.png")])
+    assert drawn.exit_code == 0 and (tmp_path / "c.png").read_bytes()[1:4] == b"PNG"
+    for zoom in ("1,2,3", "5,5,1,9"):
+        bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.png"), "--zoom", zoom])
+        assert bad.exit_code != 0 and "--zoom" in str(bad.exception)
+    assert runner.invoke(app, ["city", "make", "--seed", "1", "--size", "9", str(tmp_path / "e")]).exit_code != 0
+
+
+def test_distance_to_the_edge_is_the_one_of_geometry(large: Path) -> None:
+    """Signed distances equal shapely's distance to the whole boundary, positive inside, holes and parts included."""
+    place = read_net(large)
+    area = WalkableArea(place.walkable)
+    xy = np.random.default_rng(1).uniform(0.0, 2000.0, (300, 2))
+    points = shapely.points(xy)
+    expected = shapely.distance(points, shapely.boundary(place.walkable))
+    inside = shapely.contains(place.walkable, points)
+    assert np.array_equal(area.signed_distance(xy), np.where(inside, expected, -expected))

@@ -1,0 +1,262 @@
+"""Cities from a seed: the plan, the built net, its signals, and the store of nets."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import os
+import subprocess
+import sys
+from collections import Counter, defaultdict
+from pathlib import Path
+
+import pytest
+import shapely
+
+from cosim.core.errors import MapError, UsageError
+from cosim.place.street_map import StreetMap
+from cosim.spec.scenario import City
+from sumo_nets.city.blocks import CLASSES, STRIPE_M, corner, curve, direction, length, ring, s_bend, split
+from sumo_nets.city.city import STYLES, plan_city
+from sumo_nets.city.plan import CityPlan
+from sumo_nets.city.signals import signal_faults
+from sumo_nets.city.store import build_city, city_net
+from sumo_nets.net.net_hash import net_content_hash
+from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.netfile import read_net
+
+SAMPLE = [(1, 200.0, "mixed"), (2, 450.0, "suburb"), (3, 700.0, "downtown"), (4, 900.0, "mixed"), (5, 2000.0, "mixed")]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, float, str], Path]:
+    """The nets of SAMPLE."""
+    folder = tmp_path_factory.mktemp("cities")
+    paths = {}
+    for seed, size_m, style in SAMPLE:
+        city = City(seed=seed, size_m=size_m, style=style)
+        paths[seed, size_m, style] = folder / f"{city.name}.net.xml"
+        build_city(city, paths[seed, size_m, style])
+    return paths
+
+
+def groups(place: StreetMap) -> list[set[str]]:
+    """The strips of a map by connected component of the walking graph."""
+    beside: dict[str, set[str]] = defaultdict(set)
+    for area in place.corners.values():
+        for port in area.ports:
+            beside[port.strip] |= {other.strip for other in area.ports}
+    left, found = set(place.strips), []
+    while left:
+        front = [left.pop()]
+        group = set(front)
+        while front:
+            fresh = beside[front.pop()] - group
+            group |= fresh
+            front += fresh
+        left -= group
+        found.append(group)
+    return found
+
+
+def arms(plan: CityPlan) -> dict[str, list[float]]:
+    """Headings with which two-way streets leave each node."""
+    found = defaultdict(list)
+    for edge in plan.edges:
+        if edge.street_class != "ring":
+            found[edge.tail].append(direction(edge.line[0], edge.line[1]))
+    return found
+
+
+def test_blocks_start_and_end_where_they_are_told() -> None:
+    """Every primitive line keeps its ends, and curves leave and arrive with the turn asked for."""
+    a, b = (0.0, 0.0), (100.0, 0.0)
+    for line in (curve(a, b, 0.5), s_bend(a, b, 0.5), corner(a, (100.0, 80.0), b, 30.0)):
+        assert (line[0], line[-1]) == (a, b)
+        assert length(line) > 100.0
+    assert max(y for _, y in curve(a, b, 0.5)) > 10.0 > -0.1 < min(y for _, y in curve(a, b, 0.5))
+    assert min(y for _, y in s_bend(a, b, 0.5)) < -2.0 and max(y for _, y in s_bend(a, b, 0.5)) > 2.0
+    first, second = split(curve(a, b, 0.5), 40.0)
+    assert first[-1] == second[0] and length(first) == pytest.approx(40.0, abs=0.1)
+    arcs = ring(a, 20.0, [0.1, 2.0, 4.0])
+    assert sum(length(arc) for arc in arcs) == pytest.approx(2.0 * math.pi * 20.0, rel=0.01)
+
+
+def test_same_seed_gives_the_same_plan_and_another_seed_another() -> None:
+    """A plan is a function of seed, size and style alone."""
+    one, same, other = (plan_city(seed, 1000.0, "mixed") for seed in (7, 7, 8))
+    assert (one.nodes, one.edges, one.zebras, one.rings) == (same.nodes, same.edges, same.zebras, same.rings)
+    assert one.edges != other.edges
+    assert one.edges != plan_city(7, 1000.0, "suburb").edges
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("style", sorted(STYLES))
+def test_streets_meet_at_wide_angles_and_stay_inside(seed: int, style: str) -> None:
+    """Arms are more than 45 degrees apart, streets longer than 30 m, no node is a dead end, all inside the square."""
+    plan = plan_city(seed, 1200.0, style)
+    for node, headings in arms(plan).items():
+        order = sorted(h % (2.0 * math.pi) for h in headings)
+        gaps = [b - a for a, b in zip(order, [*order[1:], order[0] + 2.0 * math.pi], strict=True)]
+        assert len(order) > 1 or any(node in r.nodes for r in plan.rings)
+        assert len(order) == 1 or min(gaps) > math.radians(45.0)
+    for edge in plan.edges:
+        assert edge.street_class == "ring" or length(edge.line) > 40.0
+        reach = edge.section.half_m
+        assert all(reach < x < 1200.0 - reach and reach < y < 1200.0 - reach for x, y in edge.line)
+
+
+def test_large_city_shows_every_primitive_block() -> None:
+    """A 2 km city has straights, curves, corners, T, X and Y junctions, roundabouts and mid-block crosswalks."""
+    plan = plan_city(1, 2000.0, "mixed")
+    degrees = Counter(len(headings) for headings in arms(plan).values())
+    assert degrees[2] > 50 and degrees[3] > 50 and degrees[4] > 50
+    assert len(plan.rings) >= 2
+    bent = sum(len(edge.line) > 2 for edge in plan.edges) / len(plan.edges)
+    assert 0.3 < bent < 0.8
+    assert {edge.street_class for edge in plan.edges} >= {"residential", "commercial", "ring"}
+
+
+def test_sidewalks_fit_the_stripes_of_the_crowd_model() -> None:
+    """Every sidewalk and every crossing is an odd number of 0.64 m stripes wide."""
+    for made in CLASSES.values():
+        assert all(round(width / STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
+
+
+def test_widths_differ_within_the_ranges_of_the_class() -> None:
+    """One street has one cross-section; streets of a class differ, each within the ranges; wide ones have islands."""
+    plan = plan_city(3, 2000.0, "mixed")
+    sections = defaultdict(set)
+    for edge in plan.edges:
+        sections[edge.street_class].add(edge.section)
+    for name, found in sections.items():
+        made = CLASSES[name]
+        for section in found:
+            assert section.sidewalk_m in made.sidewalks_m and section.lanes == made.lanes
+            for width in ("lane_m", "verge_m", "frontage_m", "curb_m", "gutter_m", "median_m"):
+                low, high = getattr(made, width)
+                assert low - 0.026 <= getattr(section, width) <= high + 0.026
+            assert (section.median_m > 0.5) == (made.lanes > 1)
+    assert len(sections["residential"]) > 4
+
+
+def test_driveways_keep_off_the_ends_of_their_street() -> None:
+    """There are some, beside both directions, far from junctions and crosswalks."""
+    edges = [edge for edge in plan_city(3, 2000.0, "mixed").edges if edge.driveways]
+    assert len(edges) > 40 and {edge.id[0] for edge in edges} == {"-", "s"}
+    for edge in edges:
+        assert all(math.dist(at, end) > 25.0 for at in edge.driveways for end in (edge.line[0], edge.line[-1]))
+
+
+def test_cities_out_of_range_are_refused() -> None:
+    """Size, style and seed are checked, and the message lists what is valid."""
+    with pytest.raises(MapError, match=r"size_m must be in \[200, 4000\], not 50"):
+        plan_city(1, 50.0, "mixed")
+    with pytest.raises(UsageError, match=r"unknown city style 'x'. Valid choices: downtown, mixed, suburb."):
+        plan_city(1, 500.0, "x")
+    with pytest.raises(MapError, match="cannot be negative: -1"):
+        plan_city(-1, 500.0, "mixed")
+
+
+@pytest.mark.engine
+def test_built_city_is_one_walkable_whole(built: dict[tuple[int, float, str], Path]) -> None:
+    """Every strip has a corner at both ends, is reachable from every other one, and 99 % of the area is one piece."""
+    for path in built.values():
+        place = read_net(path)
+        assert all(None not in strip.corners for strip in place.strips.values())
+        assert len(groups(place)) == 1
+        areas = [part.area for part in shapely.get_parts(place.walkable)]
+        assert max(areas) > 0.99 * sum(areas)
+
+
+@pytest.mark.engine
+def test_built_city_keeps_the_zones_of_its_plan(built: dict[tuple[int, float, str], Path]) -> None:
+    """Sidewalks carry the widths of their street class, the road on their left and verges between."""
+    sections = {edge.id: edge for edge in plan_city(*SAMPLE[3]).edges}
+    place = read_net(built[SAMPLE[3]])
+    lanes: dict[str, list[tuple[str, float]]] = defaultdict(list)
+    for lane in place.lanes.values():
+        if not lane.internal:
+            lanes[lane.edge].append((lane.kind, lane.width_m))
+    for strip in place.strips.values():
+        if strip.kind == "sidewalk":
+            section = sections[strip.id].section
+            assert (strip.width_m, strip.frontage_m, strip.verge_m) == (
+                section.sidewalk_m,
+                section.frontage_m,
+                section.verge_m,
+            )
+            assert strip.curb_m == pytest.approx(section.curb_m + section.gutter_m)
+            assert (strip.road_side, strip.street_class) == (1, sections[strip.id].street_class)
+            median = [("verge", section.median_m)] if section.median_m else []
+            road = [("road", section.lane_m)] * section.lanes
+            assert lanes[strip.id] == [("verge", section.verge_m), *road, *median]
+            assert len(strip.driveways) == len(sections[strip.id].driveways)
+            assert all(6.0 < at < strip.length_m - 6.0 for at in strip.driveways)
+
+
+@pytest.mark.engine
+def test_every_signalised_crossing_has_time_to_cross(built: dict[tuple[int, float, str], Path]) -> None:
+    """Crossings get 8 s of green and are cleared at 1.1 m/s before cars go; no two links clash."""
+    for path in built.values():
+        assert signal_faults(path.read_bytes()) == []
+    assert sum(strip.signalised for strip in read_net(built[SAMPLE[4]]).strips.values()) > 100
+
+
+@pytest.mark.engine
+def test_programs_of_netconvert_would_be_found_out(built: dict[tuple[int, float, str], Path]) -> None:
+    """The check of signals notices a crossing that never gets green, and one that is not cleared."""
+    net = built[SAMPLE[2]].read_bytes()
+    assert any("never changes" in fault for fault in signal_faults(net.replace(b'G"/>', b'r"/>')))
+    hasty = net.replace(b'duration="2"', b'duration="0"').replace(b'duration="3"', b'duration="1"')
+    assert any("is cleared for" in fault for fault in signal_faults(hasty))
+
+
+@pytest.mark.engine
+def test_sumo_loads_a_city_without_a_word(built: dict[tuple[int, float, str], Path]) -> None:
+    """SUMO itself finds nothing to warn of: not in topology, not in the programs."""
+    import sumo
+
+    binary = Path(sumo.__file__).parent / "bin" / "sumo"
+    for path in built.values():
+        command = [str(binary), "-n", str(path), "-e", "1", "--no-step-log"]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.engine
+def test_city_is_equal_to_the_byte_in_another_process(
+    built: dict[tuple[int, float, str], Path], tmp_path: Path
+) -> None:
+    """Building the same city elsewhere, with another hash seed, gives the same file."""
+    seed, size_m, style = SAMPLE[3]
+    code = (
+        "from sumo_nets.city.store import city_net; from cosim.spec.scenario import City;"
+        f"print(city_net(City(seed={seed}, size_m={size_m}, style={style!r})))"
+    )
+    environment = os.environ | {"COSIM_CACHE": str(tmp_path), "PYTHONHASHSEED": "123"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
+    digests = [hashlib.sha256(p.read_bytes()).hexdigest() for p in (Path(done.stdout.strip()), built[SAMPLE[3]])]
+    assert digests[0] == digests[1]
+
+
+@pytest.mark.engine
+def test_store_builds_once_and_refuses_another_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second request is served from the cache, and a scenario made on another net is refused with a remedy."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    path = city_net(City(seed=9, size_m=200.0))
+    stamp = path.stat().st_mtime_ns
+    assert city_net(City(seed=9, size_m=200.0, net_hash=net_content_hash(path))) == path
+    assert path.stat().st_mtime_ns == stamp
+    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    with pytest.raises(MapError, match=r"made on 0123456789abcdef: delete the file to build it again"):
+        city_net(City(seed=9, size_m=200.0, net_hash="0123456789abcdef"))
+
+
+@pytest.mark.engine
+def test_netconvert_failures_are_its_complaint_on_one_line(tmp_path: Path) -> None:
+    """Bad input ends in a MapError of one line with netconvert's own words."""
+    broken = tmp_path / "broken.net.xml"
+    broken.write_text("<net")
+    with pytest.raises(MapError, match=r"^netconvert failed with exit code 1: .*broken\.net\.xml[^\n]*$"):
+        netconvert(["-s", str(broken)], tmp_path / "out.net.xml")

@@ -1,0 +1,160 @@
+"""Signalised crossings, one after another, with the real engines."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import MapError
+from cosim.core.geometry import Polyline, boxes_overlap
+from cosim.core.state import Command, RobotState
+from cosim.episode.ports import Manifest, Observation
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.judge.traffic import braking_for
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies.route import bearing_to
+from cosim.spec.events import Actor, EventReply
+from cosim.spec.scenario import City, CrowdSpec
+from scenarios.builders.crossings import AFTER_M, BEFORE_M, build_all
+from scenarios.execution.places import place
+from scenarios.execution.run import episode
+from sumo_nets.crowd.crowd import SumoCrowd
+from tests.conftest import Cosim
+
+pytestmark = pytest.mark.engine
+
+SMALL = City(seed=5, size_m=500.0)
+
+
+def test_a_crossing_scenario_is_a_short_way_over_one_signalised_crossing() -> None:
+    """Four different crossings, 10 m of sidewalk before and 8 m after each, the same ones whenever they are drawn."""
+    _, street_map = place(SMALL)
+    graph = WalkGraph(street_map)
+    drawn = build_all(SMALL, street_map, graph, 3, 4)
+    assert drawn == build_all(SMALL, street_map, graph, 3, 4)
+    assert len({scenario.crossings[0].id for scenario in drawn}) == 4
+    for scenario in drawn:
+        (crossing,) = scenario.crossings
+        assert crossing.signalised and street_map.strips[crossing.id].signalised
+        assert crossing.enter_s_m == pytest.approx(BEFORE_M, abs=0.3)
+        assert scenario.route_line.length_m - crossing.leave_s_m == pytest.approx(AFTER_M, abs=0.5)
+        ends = scenario.start[:2], scenario.goal
+        assert all(street_map.locate(*end, 0.0).kind == "walk" for end in ends)
+
+
+def test_a_city_has_only_so_many_crossings() -> None:
+    """Who asks for more than there are is told how many there are."""
+    _, street_map = place(SMALL)
+    with pytest.raises(MapError, match=r"has \d+ signalised crossings to drive over, not 10000"):
+        build_all(SMALL, street_map, WalkGraph(street_map), 3, 10_000)
+
+
+@pytest.fixture
+def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """What `cosim bench crossings` prints, in small cities."""
+    monkeypatch.setattr("scenarios.bench.crossings.SIZE_M", 600.0)
+
+    def said(*words: str, cwd: Path | None = None) -> str:
+        done = cosim("bench", "crossings", *words, cwd=cwd)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return said
+
+
+def test_the_bench_drives_over_crossings_and_counts_what_goes_at_red(bench: Callable[..., str]) -> None:
+    """One crossing from the command line: the robot arrives, nothing at red by it; people and vehicles are counted."""
+    told = bench("--crossings", "1", "--policy", "orca")
+    rows = {name.strip(): count for name, count in re.findall(r"│ ([a-z ,]+?) +│ ([\d.]+)", told)}
+    assert (rows["reached the goal"], rows["entered at red"], rows["crashed"]) == ("1", "0", "0")
+    assert rows["waited at red"] == "1"
+    assert int(re.findall(r"(\d+) vehicles passed stop lines", told)[0]) > 0
+
+
+DIES = """
+import os
+from cosim.episode.ports import Manifest
+
+class Dies:
+    manifest = Manifest("dies", rate_hz=10.0, camera=None, privileged=True)
+    before = []
+
+    def __init__(self):
+        self.raised = False
+
+    def reset(self, scenario_id, seed):
+        self.before.append(scenario_id)
+
+    def act(self, observation):
+        if len(self.before) == 2 and not self.raised:
+            os._exit(3)
+        self.raised = True
+        raise ValueError("no idea")
+"""
+
+
+def test_the_bench_keeps_what_was_driven_before_its_process_died(tmp_path: Path, bench: Callable[..., str]) -> None:
+    """A policy raises at its first crossing; made anew, it ends the process at the second: both rows say which."""
+    (tmp_path / "dies.py").write_text(DIES)
+    told = bench("--crossings", "2", "--cities", "1", "--policy", "dies:Dies", cwd=tmp_path)
+    (crashed,) = re.findall(r"│ crashed +│ 2 +│ (.+?) +│", told)
+    assert re.fullmatch(r"crossing-001-00 .*no idea.*, crossing-001-01 the process died", crashed)
+
+
+class Heedless:
+    """Follows its route at walking pace, whatever the signals and the traffic do."""
+
+    manifest = Manifest("heedless", rate_hz=10.0, camera=None, privileged=True)
+
+    def reset(self, scenario_id: str, seed: int) -> None: ...
+
+    def act(self, observation: Observation) -> Command:
+        assert observation.privileged is not None
+        bearing_rad = bearing_to(observation.privileged, 0.0)
+        return Command(0.5 * max(1.0 - abs(bearing_rad), 0.1), max(-0.65, min(0.65, 2.4 * bearing_rad)))
+
+
+def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
+    """Over a busy crossing at red, at 0.5 m/s: a car brakes to a stop before the robot, once; none touches it."""
+    _, street_map = place(SMALL)
+    drawn = build_all(SMALL, street_map, WalkGraph(street_map), 0, 1)[0]
+    busy = msgspec.structs.replace(drawn, crowd=CrowdSpec(persons=0, vehicles=40), time_limit_s=45.0)
+    slowest: dict[str, float] = {}
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        braking = braking_for(step.motion.robot.pose, step.street, step.street_after, 0.05)
+        vehicles = step.street_after.vehicles
+        for name, speed_mps in zip(vehicles.ids, vehicles.speed.tolist(), strict=True):
+            if name in braking or name in slowest:
+                slowest[name] = min(slowest.get(name, 99.0), speed_mps)
+
+    measures = episode(busy, Heedless(), watch=watch).record.measures
+    assert measures["red_light_entries"] == 1
+    assert measures["vehicles_braked"] == 1 and min(slowest.values()) < 0.1
+    assert measures["collisions_vehicle"] == 0
+    assert measures["carriageway_time_s"] is not None and measures["carriageway_time_s"] > 10.0
+
+
+@pytest.mark.parametrize("who", ["nobody", "robot", "person"])
+def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
+    """In a minute of traffic cars drive over the middle of a crossing; where a robot or a person stands, none does."""
+    net, street_map = place(SMALL)
+    crossing = Polyline(street_map.strips[":n1x2_c1"].line[:, :2])
+    assert not street_map.strips[":n1x2_c1"].signalised
+    middle = crossing.at(0.5 * crossing.length_m)
+    here = np.array([0.35, 0.275])
+    guest = Actor(id="e0", x_m=middle.x_m, y_m=middle.y_m, heading_rad=middle.heading_rad, speed_mps=0.0, doing="stand")
+    over: set[str] = set()
+    with SumoCrowd(net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]) as crowd:
+        for tick in range(1200):
+            reply = EventReply(episode="t", tick=tick, states=(), actors=(guest,) if who == "person" else ())
+            cars = crowd.step(RobotState(middle), reply, absent=who != "robot").vehicles
+            boxes = np.column_stack([cars.xy, cars.heading])
+            over |= {cars.ids[i] for i in np.flatnonzero(boxes_overlap(np.array(middle), here, boxes, cars.size / 2))}
+    assert bool(over) is (who == "nobody")

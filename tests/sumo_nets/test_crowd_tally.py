@@ -1,0 +1,93 @@
+"""What the tally counts, on streets made by hand."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
+import pytest
+import shapely
+
+from cosim.core.state import People, Signal, Street, Vehicles
+from cosim.place.street_map import StreetMap, Strip
+from scenarios.bench.crowd_tally import Tally
+
+LINE = np.array([[0.0, 0.0], [8.0, 0.0]])
+CROSSING = Strip(":j_c0", "crossing", LINE, 4.0, shapely.box(0.0, -2.0, 8.0, 2.0), (None, None), signalised=True)
+SLANT = shapely.LineString([[4.0, -6.0], [12.0, 6.0]]).buffer(2.0, cap_style="flat")
+MAP = StreetMap("m", (0.0, 0.0, 9.0, 9.0), {":j_c0": CROSSING}, {}, {}, {})
+
+
+def street(tick: int, xy: list[tuple[float, float]], walk: bool = True, vehicles: Vehicles | None = None) -> Street:
+    n = len(xy)
+    people = People.of(tuple(f"c{i}" for i in range(n)), xy, np.zeros(n), np.ones(n), ("walk",) * n)
+    cars = vehicles if vehicles is not None else Vehicles.of((), [], [], [], [])
+    return Street(tick, people, cars, MappingProxyType({":j_c0": Signal(walk)}))
+
+
+def test_overlaps_are_counted_in_pair_seconds_with_their_place() -> None:
+    """Of three people two are 0.2 m apart on the crossing for two seconds, and all pairs are in contact range."""
+    tally = Tally(MAP, 0.05, [])
+    for tick in range(100):
+        tally.see(street(tick, [(4.0, 0.0), (4.0, 0.2 if tick >= 60 else 0.7), (4.0, 1.2)]))
+    assert tally.counts["pairs in contact range"] == pytest.approx(3 * 5.0)
+    assert tally.counts["overlaps"] == pytest.approx(2.0)
+    assert tally.counts["overlaps: on crossings"] == pytest.approx(2.0)
+
+
+def test_an_entry_at_red_is_told_from_one_at_the_end_of_green() -> None:
+    """Who comes a metre far 0.5 s after the change began at green; who comes 3 s after walked at red."""
+    tally = Tally(MAP, 0.05, [])
+    for tick in range(100):
+        walked_m = -1.0 + 0.07 * tick
+        tally.see(street(tick, [(walked_m, 0.0), (walked_m - 2.9, 1.0)], walk=tick < 20))
+    assert tally.counts["persons entered signalised crossings"] == 2
+    assert tally.counts["persons entered within a second of red"] == 1
+    assert tally.counts["persons entered at red"] == 1
+    assert tally.crossings == {":j_c0"}
+
+
+def test_a_light_that_is_red_when_it_comes_into_view_is_red() -> None:
+    """Entries at red count before any green was seen, and when the light was out of view; a red from before that is
+    forgotten; who stands on a crossing that comes into view does not enter it."""
+
+    def counted(xs: list[float], walks: list[bool | None]) -> list[float]:
+        """How many entered, entered at red, and entered within a second of red."""
+        tally = Tally(MAP, 0.05, [])
+        for tick, (x_m, walk) in enumerate(zip(xs, walks, strict=True)):
+            seen = street(tick, [(x_m, 0.0)], walk=bool(walk))
+            tally.see(replace(seen, signals=MappingProxyType({})) if walk is None else seen)
+        kinds = "signalised crossings", "at red", "within a second of red"
+        return [tally.counts[f"persons entered {kind}"] for kind in kinds]
+
+    comes = [-4.0 + 0.1 * k for k in range(60)]
+    waits = [-4.0] * 100
+    assert counted(comes, [False] * 60) == [1, 1, 0]
+    assert counted(waits + comes, [True] * 50 + [None] * 50 + [False] * 60) == [1, 1, 0]
+    assert counted(waits + comes, [True] * 10 + [False] * 40 + [None] * 90 + [False] * 20) == [1, 0, 1]
+    assert counted([4.0] * 60, [None] * 20 + [False] * 40) == [0, 0, 0]
+
+
+def test_who_walks_on_one_crossing_does_not_enter_another_that_overlaps_it() -> None:
+    """A slanting crossing, red all the time, is walked through by somebody who entered the other one at green."""
+    slanting = Strip(
+        ":j_c1", "crossing", np.array([[4.0, -6.0], [12.0, 6.0]]), 4.0, SLANT, (None, None), signalised=True
+    )
+    tally = Tally(StreetMap("m", MAP.bounds, {**MAP.strips, ":j_c1": slanting}, {}, {}, {}), 0.05, [])
+    for tick in range(150):
+        seen = street(tick, [(-1.0 + 0.06 * tick, 0.0)])
+        tally.see(replace(seen, signals=MappingProxyType({**seen.signals, ":j_c1": Signal(False)})))
+    assert tally.counts["persons entered signalised crossings"] == 1
+    assert tally.counts["persons entered at red"] == 0
+
+
+def test_people_in_things_and_vehicles_are_seen() -> None:
+    """One of two people stands in a bench, the other in a car that moves; both for one second."""
+    tally = Tally(MAP, 0.05, [("bench", shapely.box(1.0, -1.0, 2.0, 1.0))])
+    car = Vehicles.of(("v0",), [[6.0, 0.0]], [0.0], [3.0], [[4.0, 2.0]])
+    for tick in range(20):
+        tally.see(street(tick, [(1.5, 0.0), (6.0, 0.5)], vehicles=car))
+    assert tally.counts["persons"] == pytest.approx(2.0)
+    assert tally.counts["in a bench"] == pytest.approx(1.0)
+    assert tally.counts["in a vehicle that moves"] == pytest.approx(1.0)

@@ -1,0 +1,411 @@
+"""What a map shows beside its streets: read, projected, brought among the streets, kept, built; and bad input."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import pytest
+import shapely
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosim.core.errors import MapError
+from cosim.core.geometry import Pose
+from cosim.core.state import Command, Street
+from cosim.place.street_map import Feature, Lane, StreetMap, Strip
+from cosim.spec.scenario import CityMap
+from physics.street.buildings import Frontage, facade_meshes
+from physics.street.clearance import clear_width
+from physics.street.furniture import KINDS, footprints
+from physics.street.mapped import HOUSES_M, THINGS_M, MappedThings
+from physics.street.placement import standing
+from physics.world.tiles import TILE_M, keys_within
+from physics.world.world import BulletWorld
+from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
+from sumo_nets.maps.featurefit import EXTENT_M, WALL_M, fitted
+from sumo_nets.maps.mapstore import about_map, import_map, map_hash, map_net, read_map
+from sumo_nets.maps.osmfeatures import HIGHEST_M, LOWEST_M, Found, Mapped, building_height_m, osm_features
+from sumo_nets.maps.osmfile import MapFile
+from sumo_nets.maps.utm import utm_xy, utm_zone
+
+SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"
+NEUKOELLN = SHARED / "berlin-neukoelln" / "input.osm.gz"
+LON, LAT = 13.40, 52.50
+Tags = dict[str, str]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Maps are kept in a folder of this run's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+class Drawing:
+    """An OSM file in metres east and north of a point in Berlin."""
+
+    def __init__(self) -> None:
+        self.rows: list[str] = []
+        self.count = 0
+
+    def node(self, x: float, y: float, tags: Tags | None = None) -> int:
+        self.count += 1
+        lon, lat = LON + x / (111_195.0 * math.cos(math.radians(LAT))), LAT + y / 111_195.0
+        self.rows.append(f'<node id="{self.count}" lon="{lon:.8f}" lat="{lat:.8f}">{_tags(tags or {})}</node>')
+        return self.count
+
+    def way(self, refs: list[int], tags: Tags) -> int:
+        self.count += 1
+        inner = "".join(f'<nd ref="{ref}"/>' for ref in refs) + _tags(tags)
+        self.rows.append(f'<way id="{self.count}">{inner}</way>')
+        return self.count
+
+    def outline(self, x0: float, y0: float, x1: float, y1: float, tags: Tags) -> int:
+        refs = [self.node(x, y) for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))]
+        return self.way([*refs, refs[0]], tags)
+
+    def relation(self, members: list[tuple[int, str]], tags: Tags) -> None:
+        self.count += 1
+        inner = "".join(f'<member type="way" ref="{ref}" role="{role}"/>' for ref, role in members) + _tags(tags)
+        self.rows.append(f'<relation id="{self.count}">{inner}</relation>')
+
+    def streets(self) -> None:
+        """Two streets that cross in the middle, with sidewalks."""
+        middle = self.node(0, 0)
+        for ends in (((-150, 0), (150, 0)), ((0, -150), (0, 150))):
+            refs = [self.node(*ends[0]), middle, self.node(*ends[1])]
+            self.way(refs, {"highway": "residential", "sidewalk": "both"})
+
+    def write(self, path: Path) -> Path:
+        rows = sorted(self.rows, key=lambda row: ("<node", "<way ", "<rela").index(row[:5]))
+        path.write_text('<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n", encoding="utf-8")
+        return path
+
+    def found(self, path: Path) -> tuple[list[Mapped], Counter[str]]:
+        self.write(path)
+        found = osm_features(MapFile(path, path, "osm", ""))
+        return list(found.things), Counter(found.skipped)
+
+
+def _tags(tags: Tags) -> str:
+    return "".join(f"<tag k={quoteattr(k)} v={quoteattr(v)}/>" for k, v in tags.items())
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[str, ...]]:
+    """A small map with things in good places and in bad ones, imported; and what the importer says it did."""
+    drawing = Drawing()
+    drawing.streets()
+    for x in (30, 60, 90):
+        drawing.node(x, 14.0, {"natural": "tree", "height": "7 m"})
+    drawing.node(75, 14.0, {"highway": "street_lamp"})
+    drawing.node(-40, 12.0, {"amenity": "bench", "direction": "S"})
+    drawing.node(-60, 0.2, {"natural": "tree"})
+    drawing.node(-90, 4.6, {"barrier": "bollard"})
+    drawing.node(1.0, 1.0, {"amenity": "waste_basket"})
+    drawing.outline(20, 20, 80, 45, {"building": "yes", "building:levels": "4"})
+    outer = drawing.outline(-80, -45, -20, -3, {})
+    inner = drawing.outline(-60, -35, -40, -25, {})
+    drawing.relation([(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "building": "yes", "height": "50'"})
+    drawing.outline(60, -3, 75, 4, {"building": "yes"})
+    path = drawing.write(tmp_path_factory.mktemp("drawn") / "drawn.osm")
+    import_map(path, "drawn")
+    return read_map("drawn"), about_map("drawn").changes
+
+
+def road_axis(street_map: StreetMap) -> float:
+    """y of the middle of the street from west to east, at x of its crossing, from its lanes."""
+    lanes = [lane.polygon for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
+    east = [lane for lane in lanes if (b := lane.bounds)[2] - b[0] > 50.0]
+    return float(shapely.union_all(east).centroid.y)
+
+
+@pytest.mark.engine
+def test_mapped_things_lie_beside_their_street(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """A lamp 14 m from the street's middle line is there in the net too; its arm points at the road, a bench faces
+    the way the map says."""
+    street_map, _ = drawn
+    lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
+    east = shapely.union_all([lane.polygon for lane in lanes if abs(np.ptp(lane.line[:, 0])) > 50.0])
+    x0, _, x1, _ = east.bounds
+    (lamp,) = (f for f in street_map.features if f.kind == "lamp")
+    across = shapely.intersection(east, shapely.LineString([(lamp.x_m, -1e3), (lamp.x_m, 1e3)]))
+    axis = shapely.centroid(across)
+    tilt = math.radians(1.27)  # the grid's north is not the pole's
+    assert x0 < lamp.x_m < x1
+    assert (lamp.y_m - axis.y) * math.cos(tilt) == pytest.approx(14.0, abs=0.1)
+    assert abs(lamp.heading_rad) == pytest.approx(math.pi, abs=0.05)
+    (bench,) = (f for f in street_map.features if f.kind == "bench")
+    assert bench.heading_rad == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.engine
+def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """Buildings keep off everything walked or driven on and keep their courtyards; things off roads and the middle of
+    sidewalks; what was moved, cut back or left out is told."""
+    street_map, changes = drawn
+    told = " | ".join(changes)
+    assert "taken from the map: 2 x building, 3 x tree" in told
+    assert "buildings cut back where they reached into streets (what is walked on wins): 1" in told
+    assert "buildings left out that lay mostly on streets or are none: 1" in told
+    assert "mapped things moved aside by up to 3 m, off the road or the middle of a sidewalk: 1" in told
+    assert "mapped things left out on a road, a crossing or in a narrow passage: 2" in told
+    lanes = [p.polygon for p in street_map.lanes.values() if p.kind == "road"]
+    walked = [p.polygon for p in (*street_map.strips.values(), *street_map.corners.values())]
+    streets = shapely.union_all([*lanes, *walked])
+    buildings = [f for f in street_map.features if f.kind == "building"]
+    assert min(shapely.distance(f.polygon, streets) for f in buildings) > WALL_M - 0.03
+    assert sorted(round(f.height_m, 2) for f in buildings) == [12.8, 15.24]
+    assert sum(len(f.polygon.interiors) for f in buildings) == 1
+    assert {round(math.sin(f.heading_rad)) for f in buildings} == {0}
+    assert {(f.y_m > road_axis(street_map)) == (math.cos(f.heading_rad) > 0.9) for f in buildings} == {True}
+    props = [p for p in standing(street_map, 1) if p.id.startswith("prop:map")]
+    assert Counter(p.kind for p in props) == {"tree": 3, "lamp": 1, "bench": 1, "bollard": 1}
+    roads = shapely.union_all(lanes)
+    assert min(shapely.distance(ground, roads) for ground in footprints(props)) > 0.0
+    sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
+    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, standing(street_map, 1)).values())
+
+
+@pytest.mark.engine
+def test_what_lies_on_the_other_side_of_the_earth_is_left_out(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """Points anywhere on earth, where the projection has no value too, come to nothing."""
+    location = {"projParameter": "+proj=utm +zone=33 +datum=WGS84", "netOffset": "-391000.0,-5817000.0"}
+    spots = [(lon, lat) for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0) for lat in (-85.0, 0.0, 52.5, 85.0)]
+    things = [Mapped("tree", (np.array([spot]),), 0.0, None) for spot in spots]
+    square = np.array([(0.0, 0.0), (1e-3, 0.0), (1e-3, 1e-3), (0.0, 1e-3), (0.0, 0.0)])
+    things += [Mapped("building", (square + spot,), 9.0, None) for spot in spots]
+    assert fitted(Found(tuple(things), {}), location, drawn[0]) == ((), [])
+
+
+@pytest.mark.engine
+def test_nothing_is_made_up_where_the_map_shows_it(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """Near a mapped lamp or house there is no other, farther away there are; without features they are near too."""
+    street_map, _ = drawn
+    bare = dataclasses.replace(street_map, features=())
+    (lamp,) = (f for f in street_map.features if f.kind == "lamp")
+    away = [
+        sorted(math.hypot(p.x_m - lamp.x_m, p.y_m - lamp.y_m) for p in standing(place, seed) if p.kind == "lamp")
+        for place in (street_map, bare)
+        for seed in range(4)
+    ]
+    assert all(found[0] == 0.0 and found[1] > THINGS_M for found in away[:4])
+    assert min(map(min, away[4:])) < THINGS_M
+    x0, y0, x1, y1 = street_map.bounds
+    keys = keys_within(0.5 * (x0 + x1), 0.5 * (y0 + y1), 300.0)
+    rows = [b for key in keys for b in Frontage(street_map, 1, MappedThings(street_map)).in_tile(key)]
+    made_up_houses = [b for b in rows if b.outline is None]
+    near = shapely.union_all([f.polygon for f in street_map.features if f.kind == "building"])
+    assert made_up_houses and min(shapely.distance(b.polygon, near) for b in made_up_houses) > HOUSES_M
+    assert len([b for key in keys for b in Frontage(bare, 1).in_tile(key)]) > len(made_up_houses)
+
+
+def house(*corners: tuple[float, float], height_m: float = 9.0) -> Feature:
+    polygon = shapely.Polygon(corners)
+    return Feature("building", polygon.centroid.x, polygon.centroid.y, 0.0, height_m, polygon)
+
+
+def lone_map(*features: Feature) -> StreetMap:
+    """A sidewalk along x, 3 m wide, on open ground."""
+    line = np.array([[-60.0, 0.0], [60.0, 0.0]])
+    strip = Strip("s", "sidewalk", line, 3.0, shapely.box(-60, -1.5, 60, 1.5), (None, None), road_side=0)
+    lane = Lane("r_0", "r", "road", line - (0.0, 5.0), 3.0, shapely.box(-60, -6.5, 60, -3.5))
+    return StreetMap("lone", (-60, -20, 60, 20), {"s": strip}, {}, {"r_0": lane}, {}, features=features)
+
+
+def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
+    """The parts in the tiles cover the house once, their walls are its walls and no cut is one, and the mesh has the
+    walls' and the roof's area."""
+    place = lone_map(house((-40, 4), (40, 4), (40, 60), (10, 60), (10, 20), (-40, 20), height_m=7.5))
+    things, whole = MappedThings(place), place.features[0].polygon
+    parts = [b for key in keys_within(0.0, 0.0, 2.0 * TILE_M) for b in things.buildings(key)]
+    assert len(parts) == 3
+    assert sum(b.polygon.area for b in parts) == pytest.approx(whole.area)
+    assert {b.id for b in parts} == {"building:map:0"} and len({b.facade for b in parts}) == 1
+    lengths = [math.dist(w[:2], w[2:]) for b in parts for w in b.walls]
+    assert sum(lengths) == pytest.approx(whole.length)
+    walls = [mesh for facade, mesh in facade_meshes(tuple(parts)).items() if facade >= 0]
+    area = 0.0
+    for mesh in walls:
+        corners = mesh.vertices[mesh.triangles]
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area += 0.5 * float(np.linalg.norm(cross, axis=1).sum())
+        assert np.all((cross * mesh.normals[mesh.triangles[:, 0]]).sum(axis=1) > 0.0)
+        assert mesh.vertices[:, 2].max() == pytest.approx(7.62)
+    assert area == pytest.approx(whole.area + 7.5 * whole.length)
+
+
+@pytest.mark.engine
+def test_the_robot_stops_at_a_mapped_wall() -> None:
+    """Driven at a wall that runs aslant the robot touches it as a wall and does not pass."""
+    place = lone_map(house((0, 3), (14, 12), (0, 20), (-14, 12)))
+    with BulletWorld(place, seed=1) as world:
+        world.place(Pose(3.0, -0.5, math.pi / 2))
+        motions = [world.step(Command(1.0, 0.0), Street(0), Street(0), 10) for _ in range(160)]
+    assert {(c.kind, c.other.split(":")[1]) for m in motions for c in m.contacts} == {("wall", "map")}
+    assert not place.features[0].polygon.contains(shapely.Point(motions[-1].robot.pose.xy))
+
+
+def test_room_is_kept_for_the_largest_of_each_thing() -> None:
+    """What the importer keeps free for a thing is at least what the catalogue's largest covers."""
+    for kind, (length, depth) in EXTENT_M.items():
+        large = KINDS[kind].sizes_m[1]
+        assert length >= large[0] and depth >= large[1], kind
+
+
+def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None:
+    """Written and read they are the same; a broken file is named; a map's hash covers them."""
+    features = (house((0, 0), (9, 0), (9, 9), (0, 9)), Feature("tree", 3.5, -2.25, 0.1, 6.0))
+    path = tmp_path / NAME
+    assert read_features(path) == () and with_features("abc", path) == "abc"
+    write_features(features, path)
+    assert read_features(path) == features
+    assert with_features("abc", path) not in ("abc", with_features("abd", path))
+    good = path.read_text()
+    for broken in (
+        good[:-9],
+        good.replace("tree", "ufo"),
+        good.replace("6.0", "-6.0"),
+        good.replace("9.0", "0.0"),
+        "[]",
+    ):
+        path.write_text(broken)
+        with pytest.raises(MapError, match=r"features\.json: cannot be read: .*: import the map again"):
+            read_features(path)
+
+
+@pytest.mark.engine
+def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """The hash in a scenario's place is that of net and features together."""
+    street_map, _ = drawn
+    net = map_net("drawn")
+    assert street_map.net_hash == map_hash(net) == about_map("drawn").net_hash
+    assert map_net(CityMap(map="drawn", net_hash=street_map.net_hash)) == net
+    kept = net.with_name(NAME).read_bytes()
+    try:
+        write_features(street_map.features[1:], net.with_name(NAME))
+        with pytest.raises(MapError, match="but the scenario was made on"):
+            map_net(CityMap(map="drawn", net_hash=street_map.net_hash))
+    finally:
+        net.with_name(NAME).write_bytes(kept)
+
+
+@pytest.mark.parametrize(
+    ("tags", "height_m", "unread"),
+    [
+        ({"height": "12"}, 12.0, 0), ({"height": "12.5 m"}, 12.5, 0), ({"height": "12,5"}, 12.5, 0),
+        ({"height": "40'"}, 12.192, 0), ({"height": "5'6\""}, LOWEST_M, 0), ({"building:levels": "5"}, 16.0, 0),
+        ({"height": "tall"}, 9.6, 1), ({"height": "1e9"}, 9.6, 1), ({"height": "99999"}, 9.6, 1),
+        ({"height": "-4"}, 9.6, 1), ({"height": "nan", "building:levels": "2"}, 6.4, 1), ({"height": "0"}, 9.6, 0),
+        ({"height": "800"}, HIGHEST_M, 0), ({"building": "garage"}, 3.2, 0), ({"building": "house"}, 6.4, 0),
+    ],
+)  # fmt: skip
+def test_heights_are_read_as_mappers_write_them(tags: Tags, height_m: float, unread: int) -> None:
+    """Metres, feet, storeys; what cannot be read or cannot be is counted and the kind decides."""
+    skipped: Counter[str] = Counter()
+    assert building_height_m({"building": "yes"} | tags, 200.0, skipped) == pytest.approx(height_m)
+    assert sum(skipped.values()) == unread
+
+
+def test_broken_outlines_are_left_out_and_counted(tmp_path: Path) -> None:
+    """Open, crossed, tiny, torn, hanging and underground buildings are no buildings; the good one stays."""
+    drawing, house_tags = Drawing(), {"building": "yes"}
+    drawing.outline(0, 0, 10, 10, house_tags)
+    a, b, c, d = (drawing.node(x, y) for x, y in ((0, 0), (9, 9), (9, 0), (0, 9)))
+    drawing.way([a, b, c, d, a], house_tags)
+    drawing.way([a, c, b, d], house_tags)
+    drawing.way([a, 99_999, b, a], house_tags)
+    drawing.way([], house_tags)
+    drawing.outline(0, 0, 0.1, 0.1, house_tags)
+    drawing.outline(0, 0, 10, 10, {"building": "roof"})
+    drawing.outline(0, 0, 10, 10, {"building": "yes", "layer": "-1"})
+    drawing.outline(0, 0, 10, 10, {"building": "yes", "min_height": "6"})
+    half = drawing.way([a, c, b], {})
+    drawing.relation([(half, "outer")], {"type": "multipolygon", "building": "yes"})
+    drawing.relation([(half, "outer"), (99_999, "outer")], {"type": "multipolygon", "building": "yes"})
+    things, skipped = drawing.found(tmp_path / "broken.osm")
+    assert [thing.kind for thing in things] == ["building"]
+    assert skipped == {
+        "buildings whose outline crosses itself": 1,
+        "buildings with an open outline": 4,
+        "buildings with missing nodes": 1,
+        "buildings too small or too large to be one": 1,
+        "roofs, ruins and plans of buildings": 1,
+        "buildings above or under the ground": 2,
+    }
+
+
+WORDS = st.text(max_size=6) | st.sampled_from(
+    ["", "tall", "1e9", "12 m", "40'", "-3", "nan", "inf", "0", "9" * 30, "Ø", "5;6"]
+)
+PAIRS = st.sampled_from(
+    [
+        ("building", "yes"), ("natural", "tree"), ("natural", "tree_row"), ("highway", "street_lamp"),
+        ("amenity", "bench"), ("barrier", "bollard"), ("emergency", "fire_hydrant"), ("type", "multipolygon"),
+    ]
+)  # fmt: skip
+KEYS = st.sampled_from(
+    ["height", "building:levels", "min_height", "building", "direction", "layer", "fire_hydrant:type", "location"]
+)
+
+
+@settings(max_examples=100)
+@given(data=st.data())
+def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    """Any tags, outlines, members and missing nodes: no exception, only finite things of sound height and outline."""
+    drawing = Drawing()
+    spots = st.tuples(st.floats(-200, 200), st.floats(-200, 200))
+    tags = st.dictionaries(KEYS, WORDS.filter(lambda w: w.isprintable()), max_size=4)
+    at = data.draw(st.lists(spots, max_size=6))
+    nodes = [drawing.node(x, y, dict([data.draw(PAIRS)]) | data.draw(tags)) for x, y in at]
+    refs = st.lists(st.sampled_from([*nodes, 77_777]), max_size=7)
+    ways = []
+    for way in data.draw(st.lists(refs, max_size=4)):
+        closed = [*way, way[0]] if way and data.draw(st.booleans()) else way
+        ways.append(drawing.way(closed, dict([data.draw(PAIRS)]) | data.draw(tags)))
+    roles = st.sampled_from(["outer", "inner", "?"])
+    members = st.lists(st.tuples(st.sampled_from([*ways, 88_888]), roles), max_size=4)
+    drawing.relation(data.draw(members), {"building": "yes", "type": "multipolygon"} | data.draw(tags))
+    things, skipped = drawing.found(tmp_path_factory.mktemp("any") / "any.osm")
+    assert all(count > 0 for count in skipped.values())
+    for thing in things:
+        assert all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
+        if thing.kind == "building":
+            assert LOWEST_M <= thing.height_m <= HIGHEST_M
+            assert shapely.Polygon(thing.rings[0], thing.rings[1:]).is_valid
+
+
+def test_the_projection_is_utm_or_none() -> None:
+    """Points worked out by PROJ's own test tables agree to the millimetre; other projections are recognised."""
+    proj = "+proj=utm +zone=32 +ellps=WGS84 +datum=WGS84 +units=m +no_defs"
+    assert utm_zone(proj) == (32, False) and utm_zone(proj + " +south") == (32, True)
+    assert utm_zone("!") is None and utm_zone("+proj=tmerc +lat_0=0") is None and utm_zone("+proj=utm +zone=99") is None
+    on_axis = utm_xy(np.array([[9.0, 0.0], [9.0, 45.0]]), 32, False)
+    assert on_axis[:, 0] == pytest.approx(500_000.0, abs=1e-6)
+    assert on_axis[1, 1] == pytest.approx(4_982_950.400, abs=1e-3)
+    south = utm_xy(np.array([[9.0, -45.0]]), 32, True)
+    assert south[0, 1] == pytest.approx(10_000_000.0 - 4_982_950.400, abs=1e-3)
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not NEUKOELLN.exists(), reason="the shared maps are not here")
+def test_a_finely_mapped_place_is_built_as_mapped() -> None:
+    """Neukölln: most of its lamps, trees and houses stand; none on a road; every walk as free as without them."""
+    import_map(NEUKOELLN, "neukoelln")
+    street_map = read_map("neukoelln")
+    counts = Counter(f.kind for f in street_map.features)
+    assert counts["building"] > 110 and counts["tree"] > 120 and counts["lamp"] > 38 and counts["bench"] > 14
+    props = standing(street_map, 0)
+    mapped = [p for p in props if p.id.startswith("prop:map")]
+    roads = shapely.STRtree([lane.polygon for lane in street_map.lanes.values() if lane.kind == "road"])
+    assert not len(roads.query(footprints(mapped), predicate="intersects")[0])
+    sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
+    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props).values())

@@ -1,0 +1,253 @@
+"""People who walk in groups, elderly people and children."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+from cosim.core.errors import SpecError
+from cosim.core.geometry import Floats, Pose
+from cosim.core.state import People, RobotState, Street
+from cosim.people.gait import age_of
+from cosim.place.street_map import Strip
+from cosim.spec.events import EventReply
+from cosim.spec.scenario import City, CrowdSpec
+from scenarios.bench.group_tally import widest_gaps
+from scenarios.catalog import suite, with_crowd
+from sumo_nets.city.store import build_city
+from sumo_nets.crowd.crowd import SumoCrowd
+from sumo_nets.crowd.group_cohesion import Together
+from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOW_MPS, Companies, Company
+from sumo_nets.net.netfile import read_net
+
+LINE = np.array([[0.0, 0.0], [50.0, 0.0]])
+STRIPS = {
+    "s": Strip("s", "sidewalk", LINE, 3.2, None, (None, None)),  # type: ignore[arg-type]
+    "t": Strip("t", "sidewalk", LINE, 3.2, None, (None, None)),  # type: ignore[arg-type]
+    ":c": Strip(":c", "crossing", LINE, 3.2, None, (None, None)),  # type: ignore[arg-type]
+}
+
+
+class Spot(NamedTuple):
+    x_m: float
+    y_m: float
+
+
+class Walkers:
+    """A SUMO of two who walk east: where they are, and at what speed they were told to walk."""
+
+    def __init__(self, **at: tuple[str, float, float]) -> None:
+        self.at = dict(at)
+        self.told: dict[str, float] = {}
+        self.person = SimpleNamespace(
+            getRoadID=lambda name: self.at[name][0],
+            getLanePosition=lambda name: self.at[name][1],
+            getSpeed=lambda name: 1.3,
+            setSpeed=self.told.__setitem__,
+            moveToXY=lambda name, edge, x, y, *_: self.at.update({name: (self.at[name][0], x, y)}),
+        )
+        self.lane = SimpleNamespace(getShape=lambda lane: LINE.tolist(), getLength=lambda lane: 50.0)
+
+    def seen(self) -> dict[str, Any]:
+        return {name: Spot(x, y) for name, (_, x, y) in self.at.items()}
+
+    def advance(self, way_m: float) -> None:
+        self.at = {name: (edge, x + way_m, y) for name, (edge, x, y) in self.at.items()}
+
+
+def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
+    """What two who walk together at 1.3 m/s are told in some looks, half a second apart."""
+    together = Together(walkers, STRIPS, 0.05)
+    together.join(tuple(walkers.at), 1.3, ("s",))
+    for _ in range(looks):
+        together.keep(walkers.seen())
+        walkers.advance(0.65)
+    return walkers.told
+
+
+def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
+    """Of many persons 40 % walk in groups, 10 % are elderly, 15 % children; each child has an adult, and is slow."""
+    companies = Companies(CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1))
+    drawn = []
+    for _ in range(8000):
+        drawn.append(companies.coming)
+        companies.entered()
+    persons = sum(company.size for company in drawn)
+    ages = Counter(age for company in drawn for age in company.ages)
+    assert sum(c.size for c in drawn if c.size > 1) / persons == pytest.approx(0.4, abs=0.02)
+    assert ages["elder"] / persons == pytest.approx(0.1, abs=0.015)
+    assert ages["child"] / persons == pytest.approx(0.15, abs=0.015)
+    assert {company.size for company in drawn} == {1, 2, 3}
+    families = [company for company in drawn if "child" in company.ages]
+    assert all("adult" in family.ages and family.pace_mps == SLOW_MPS for family in families)
+    assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {"adult"})
+
+
+def test_without_groups_and_ages_nothing_is_drawn() -> None:
+    """A plain crowd takes no numbers from the generator, and everybody walks alone."""
+    rng = np.random.default_rng(1)
+    companies = Companies(CrowdSpec(), rng)
+    for _ in range(10):
+        assert companies.coming == Company(("",))
+        companies.entered()
+    assert rng.random() == np.random.default_rng(1).random()
+
+
+def test_a_group_walks_abreast_where_there_is_room() -> None:
+    """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower than one."""
+    three = Company(("", "", ""))
+    assert np.array(three.places(1.92)) == pytest.approx(np.array([(-0.64, 0.0), (0.0, 0.0), (0.64, 0.0)]))
+    assert np.array(three.places(1.3)) == pytest.approx(np.array([(-0.32, 0.0), (0.32, 0.0), (0.0, 0.8)]))
+    assert np.array(three.places(0.64)) == pytest.approx(np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)]))
+    assert three.walks_at(1.5) == pytest.approx(1.42) and three.walks_at(1.12) == 1.1
+
+
+def test_who_is_ahead_slows_down_and_who_lags_hurries() -> None:
+    """A metre apart on a sidewalk the first is told to walk slower, the second faster, abreast nobody is told anything;
+    but nobody slows down on a crossing."""
+    told = kept(Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64)))
+    assert told["c0"] < 1.2 and 1.3 < told["c1"] < 1.44
+    assert kept(Walkers(c0=("s", 10.1, 0.0), c1=("s", 10.0, 0.64))) == {}
+    assert "c0" not in kept(Walkers(c0=(":c", 11.0, 0.0), c1=(":c", 10.0, 0.64)))
+
+
+def test_who_is_far_ahead_waits() -> None:
+    """Three metres ahead one waits, and walks on when the fellow is near; also if a light has parted them."""
+    walkers = Walkers(c0=("s", 13.0, 0.0), c1=("s", 10.0, 0.64))
+    together = Together(walkers, STRIPS, 0.05)
+    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    for _ in range(2):
+        together.keep(walkers.seen())
+        walkers.advance(0.65)
+    assert walkers.told["c0"] == 0.0 and walkers.told["c1"] > 1.3
+    walkers.at["c1"] = ("s", walkers.at["c0"][1] - 1.0, 0.64)
+    together.keep(walkers.seen())
+    assert walkers.told["c0"] > 1.0
+
+    parted = Walkers(c0=("t", 11.0, 0.0), c1=("s", 10.0, 0.64))
+    together = Together(parted, STRIPS, 0.05)
+    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    for _ in range(6):
+        parted.at["c0"] = ("t", parted.at["c0"][1] + 0.65, 0.0)
+        together.keep(parted.seen())
+    assert parted.told["c0"] == 0.0 and parted.told["c1"] > 1.3
+
+
+def test_who_walks_aside_steps_back_unless_somebody_comes() -> None:
+    """1.9 m beside its fellow somebody steps 0.34 m nearer; not where another comes towards that place."""
+    walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
+    kept(walkers, looks=3)
+    assert sorted(y for _, _, y in walkers.at.values()) in ([0.0, 1.58], [0.34, 1.92])
+    walkers = Walkers(c0=("s", 20.0, 0.0), c1=("s", 20.0, 1.92))
+    together = Together(walkers, STRIPS, 0.05)
+    together.join(("c0", "c1"), 1.3, ("s", ":c", "t"))
+    for _ in range(3):
+        together.keep({**walkers.seen(), "c9": Spot(walkers.at["c0"][1] + 3.0, 0.96)})
+        walkers.advance(0.65)
+    assert [y for _, _, y in walkers.at.values()] == [0.0, 1.92]
+
+
+def test_who_has_left_is_forgotten() -> None:
+    """Of three one leaves, and two are a group; the last one walks on at its own speed; two may leave at once."""
+    walkers = Walkers(c0=("s", 11.0, 0.0), c1=("s", 10.0, 0.64), c2=("s", 10.0, 1.28))
+    together = Together(walkers, STRIPS, 0.05)
+    together.join(("c0", "c1", "c2"), 1.3, ("s",))
+    together.join(("c3", "c4"), 1.2, ("s",))
+    for _ in range(2):
+        together.keep(walkers.seen())
+        walkers.advance(0.65)
+    assert walkers.told["c0"] < 1.3
+    together.forget(["c0", "c1"])
+    assert together.groups == (("c0", "c1"),) and together.fellows("c2") == ("c2",)
+    together.forget(["c0"])
+    assert together.groups == () and walkers.told["c0"] == 1.3
+
+
+def test_the_gap_of_a_group_is_that_of_its_loneliest_member() -> None:
+    """Of three in a row, 0.5 and 2 m apart, the last is 2 m from its nearest fellow; who is alone has no gap."""
+    people = People.of(
+        ("a", "b", "c", "d"), [[0.0, 0.0], [0.5, 0.0], [2.5, 0.0], [9.0, 0.0]], np.zeros(4), np.ones(4), ("walk",) * 4
+    )
+    assert widest_gaps([("a", "b", "c"), ("d", "gone")], people) == [2.0]
+
+
+def test_a_suite_can_be_asked_for_groups() -> None:
+    """`--groups 0.4` makes another suite, whose version says so; nothing asked leaves it; children need groups."""
+    shipped = suite("reactive")
+    asked = with_crowd(shipped, groups=0.4, children=None)
+    assert {scenario.crowd.groups for scenario in asked.scenarios} == {0.4}
+    assert asked.version == f"{shipped.version}-groups0.4" and asked.content_hash != shipped.content_hash
+    assert with_crowd(shipped, groups=None) is shipped
+    with pytest.raises(SpecError, match=r"give groups of 0\.2 or more"):
+        with_crowd(shipped, children=0.1)
+
+
+@pytest.mark.engine
+def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
+    """For over a minute groups stay near, are as many as asked, of the right ages and paces; bit for bit again."""
+    net = tmp_path / "city.net.xml"
+    build_city(City(seed=2, size_m=600.0), net)
+    street_map = read_net(net)
+    x0, y0, x1, y1 = street_map.bounds
+    start = Pose((x0 + x1) / 2, (y0 + y1) / 2, 0.0)
+    spec = CrowdSpec(persons=50, vehicles=4, groups=0.5, elderly=0.1, children=0.15)
+
+    def run(ticks: int) -> tuple[list[Street], list[tuple[tuple[str, ...], ...]]]:
+        with SumoCrowd(net, street_map, spec, 3, frozenset(), start[:2]) as crowd:
+            streets, groups = [crowd.street], [crowd.groups]
+            for tick in range(ticks):
+                reply = EventReply(episode="test", tick=tick, states=(), actors=())
+                streets.append(crowd.step(RobotState(start), reply))
+                groups.append(crowd.groups)
+        return streets, groups
+
+    def inside(street: Street) -> Floats:
+        return np.asarray(np.hypot(*(street.people.xy - start[:2]).T) < spec.radius_m)
+
+    streets, groups = run(1500)
+    gaps_m = [gap for k in range(0, 1500, 10) for gap in widest_gaps(groups[k], streets[k].people)]
+    assert len(gaps_m) > 1500
+    assert np.median(gaps_m) < 1.0 and np.percentile(gaps_m, 95) < 2.0
+    assert np.mean(np.array(gaps_m) > 2.0) < 0.05
+    assert np.mean([inside(street).sum() for street in streets]) == pytest.approx(50, rel=0.05)
+
+    ids = [name for street in streets[::100] for name in street.people.ids]
+    together = {name for now in groups for names in now for name in names}
+    assert np.mean([name in together for name in ids]) == pytest.approx(0.5, abs=0.15)
+    assert {age_of(name) for name in ids} == {"child", "adult", "elder"}
+    assert all(any(age_of(name) == "adult" for name in names) for names in groups[0] if "child" in map(age_of, names))
+    assert {name for name in ids if age_of(name) == "child"} <= together
+    walking = [(street.people.speed[i], age_of(n)) for street in streets[::20] for i, n in enumerate(street.people.ids)]
+    pace = {age: np.median([v for v, a in walking if a == age and v > 0.5]) for age in ("child", "elder", "adult")}
+    assert 0.75 < pace["child"] < 1.12 and 0.75 < pace["elder"] < 1.12 and pace["adult"] > 1.12
+
+    again, _ = run(200)
+    for a, b in zip(streets, again, strict=False):
+        assert a.people.ids == b.people.ids and a.people.xy.tobytes() == b.people.xy.tobytes()
+
+
+@pytest.mark.engine
+def test_a_group_is_taken_out_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where everybody who does not wait at red is taken out at the next look, all who walk along leave in that tick."""
+    monkeypatch.setattr("sumo_nets.crowd.demand.STUCK_S", -1.0)
+    net = tmp_path / "city.net.xml"
+    build_city(City(seed=2, size_m=600.0), net)
+    street_map = read_net(net)
+    x0, y0, x1, y1 = street_map.bounds
+    start = Pose((x0 + x1) / 2, (y0 + y1) / 2, 0.0)
+    spec = CrowdSpec(persons=80, vehicles=10, groups=0.9)
+    left = 0
+    with SumoCrowd(net, street_map, spec, 3, frozenset(), start[:2]) as crowd:
+        for tick in range(60):
+            groups, before = crowd.groups, set(crowd.street.people.ids)
+            reply = EventReply(episode="test", tick=tick, states=(), actors=())
+            after = set(crowd.step(RobotState(start), reply).people.ids)
+            whole = [set(names) for names in groups if set(names) <= before]
+            left += sum(not names & after for names in whole)
+            assert tick % 10 or all(names <= after or not names & after for names in whole)
+    assert left > 10

@@ -1,0 +1,459 @@
+"""Importing city maps: OpenStreetMap and SUMO files, whole, packed, broken; the shared maps where they are."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cosim.core.errors import MapError, UsageError
+from cosim.place.route_line import through_corner
+from cosim.place.street_map import Port
+from cosim.spec.scenario import City, CityMap
+from sumo_nets.city.store import build_city
+from sumo_nets.maps import importer, mapstore
+from sumo_nets.maps.cornermend import mend_corners
+from sumo_nets.maps.drivingside import left_hand_country
+from sumo_nets.maps.importer import Options
+from sumo_nets.maps.mapstore import (
+    about_map,
+    checked_map,
+    import_map,
+    known_maps,
+    map_name,
+    map_net,
+    maps_folder,
+    read_map,
+)
+from sumo_nets.maps.signalcheck import mend_signals
+from sumo_nets.net.netconvert import netconvert
+from sumo_nets.net.netfacts import read_facts, walks_of
+from sumo_nets.net.netfile import read_net
+from tests.conftest import Cosim
+
+MAPS = Path(__file__).parents[3] / "shared" / "maps"
+NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
+CAR_ONLY = ("hamburg-tavf", "eichstaett-crowdnav", "braunschweig-bs3d")
+BERLIN, LONDON = (13.40, 52.50), (-0.12, 51.50)
+
+
+def osm(at: tuple[float, float] = BERLIN, highway: str = "residential", sidewalk: str = "both", blocks: int = 3) -> str:
+    """A grid of streets 120 m apart with a footway across one block."""
+    lon, lat = at
+    number = {(i, k): 1 + i * (blocks + 1) + k for i in range(blocks + 1) for k in range(blocks + 1)}
+    rows = [
+        f'<node id="{n}" lon="{lon + 0.0017 * i:.7f}" lat="{lat + 0.0011 * k:.7f}"/>' for (i, k), n in number.items()
+    ]
+    tags = f'<tag k="highway" v="{highway}"/><tag k="name" v="A &amp; Ö &quot;台北&quot;"/>'
+    tags += f'<tag k="sidewalk" v="{sidewalk}"/>' if sidewalk else ""
+    for line in range(blocks + 1):
+        for way, refs in (
+            (100 + line, [number[line, k] for k in range(blocks + 1)]),
+            (200 + line, [number[i, line] for i in range(blocks + 1)]),
+        ):
+            rows.append(f'<way id="{way}">' + "".join(f'<nd ref="{ref}"/>' for ref in refs) + tags + "</way>")
+    corner = number[min(1, blocks), min(1, blocks)]
+    rows.append(f'<way id="300"><nd ref="{number[0, 0]}"/><nd ref="{corner}"/><tag k="highway" v="footway"/></way>')
+    rows.append('<way id="301"><nd ref="1"/><nd ref="999"/><tag k="highway" v="footway"/></way><way id="302"/>')
+    return '<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6">\n' + "\n".join(rows) + "\n</osm>\n"
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@cache
+def small_city() -> bytes:
+    """The net of a city of 300 m."""
+    path = mapstore.cache_folder() / "small.net.xml"
+    build_city(City(seed=3, size_m=300.0), path)
+    return path.read_bytes()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Maps are kept in a folder of this run's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def kept() -> list[str]:
+    """Everything in the folder of maps, scratch folders included."""
+    return sorted(p.name for p in maps_folder().iterdir()) if maps_folder().is_dir() else []
+
+
+@pytest.mark.engine
+def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
+    """Streets get sidewalks, crossings and corners in one piece; source, changes and licence are kept with the net."""
+    about = import_map(written(tmp_path / "Kleine Stadt.osm", osm()))
+    street_map, check, again = checked_map("kleine-stadt")
+    assert again == about and about.source == "Kleine Stadt.osm" and about.guessed_share == 0.0
+    assert street_map.name == "kleine-stadt" and street_map.net_hash == about.net_hash
+    assert check.usable and check.unit_possible and check.long_horizon_possible
+    assert check.islands[0].share > 0.99 and check.crossings >= 16 and check.corners >= 16
+    assert "OpenStreetMap contributors" in about.licences[0]
+    assert any("on the right" in change for change in about.changes)
+    assert known_maps()["kleine-stadt"].origin == "imported"
+
+
+@pytest.mark.engine
+def test_every_packing_gives_the_same_net(tmp_path: Path) -> None:
+    """Plain, gzip, bzip2 and PBF files of one map become one and the same net."""
+    import osmium
+
+    plain = written(tmp_path / "town.osm", osm())
+    (tmp_path / "town.osm.gz").write_bytes(gzip.compress(plain.read_bytes()))
+    (tmp_path / "town.osm.bz2").write_bytes(bz2.compress(plain.read_bytes()))
+    with osmium.SimpleWriter(str(tmp_path / "town.osm.pbf")) as writer:
+        for thing in osmium.FileProcessor(str(plain)):
+            writer.add(thing)
+    hashes = {p.name: import_map(p, "packed").net_hash for p in sorted(tmp_path.glob("town.*"))}
+    assert len(hashes) == 4 and len(set(hashes.values())) == 1, hashes
+
+
+@pytest.mark.engine
+def test_driving_side_is_looked_up_and_can_be_said(tmp_path: Path) -> None:
+    """London drives on the left, unless told otherwise; the sidewalk is then left of the road."""
+    source = written(tmp_path / "town.osm", osm(LONDON))
+    assert "United Kingdom" in " ".join(import_map(source, "london").changes)
+    left = read_map("london")
+    import_map(source, "london", Options(lefthand=False))
+    right = read_map("london")
+    assert left.left_hand and not right.left_hand
+    sides = [{s.road_side for s in m.strips.values() if s.kind == "sidewalk" and s.road_side} for m in (left, right)]
+    assert sides == [{-1}, {1}]
+
+
+@pytest.mark.parametrize(
+    ("lon", "lat", "country"),
+    [
+        (139.7, 35.7, "Japan"),
+        (-64.88, 17.71, "Virgin Islands"),
+        (151.2, -33.9, "Australia"),
+        (1.85, 50.95, None),
+        (1.31, 51.13, "United Kingdom and Ireland"),
+        (114.06, 22.55, None),
+        (126.98, 37.57, None),
+        (-66.1, 18.46, None),
+    ],
+)
+def test_left_hand_countries(lon: float, lat: float, country: str | None) -> None:
+    """Capitals and border towns fall on the right side of the table."""
+    assert left_hand_country(lon, lat) == country
+
+
+@pytest.mark.engine
+def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
+    """A SUMO net with sidewalks and walking areas comes out as the same place, zones included."""
+    source = tmp_path / "good.net.xml.gz"
+    source.write_bytes(gzip.compress(small_city()))
+    before = read_net(source)
+    about = import_map(source)
+    after = read_map("good")
+    for a, b in zip(after.strips.values(), before.strips.values(), strict=True):
+        assert (a.id, a.kind, a.corners, a.signalised, a.crosses) == (b.id, b.kind, b.corners, b.signalised, b.crosses)
+        assert (a.width_m, a.frontage_m, a.curb_m, a.verge_m) == (b.width_m, b.frontage_m, b.curb_m, b.verge_m)
+        assert a.polygon.equals(b.polygon)
+    assert [(c.id, c.ports) for c in after.corners.values()] == [(c.id, c.ports) for c in before.corners.values()]
+    assert about.guessed_share is None and about.changes[0] == "unpacked (gzip)"
+
+
+@pytest.mark.engine
+def test_nets_for_cars_alone_need_upgrade(tmp_path: Path) -> None:
+    """Without --upgrade they are refused with the advice; with it they get sidewalks that are said to be guessed."""
+    source = written(tmp_path / "town.osm", osm(sidewalk=""))
+    net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
+    before = kept()
+    with pytest.raises(MapError, match="with --upgrade"):
+        import_map(net)
+    assert kept() == before
+    about = import_map(net, options=Options(upgrade=True))
+    _, check, _ = checked_map("cars")
+    assert check.usable and about.guessed_share is not None and about.guessed_share > 0.9
+
+
+@pytest.mark.engine
+def test_bbox_keeps_a_part(tmp_path: Path) -> None:
+    """A box keeps the streets in it, and only those; a box elsewhere is refused."""
+    source, (lon, lat) = written(tmp_path / "town.osm", osm()), BERLIN
+    import_map(source, "whole")
+    import_map(source, "part", Options(bbox=(lon - 0.001, lat - 0.001, lon + 0.002, lat + 0.0015)))
+    whole, part = read_map("whole"), read_map("part")
+    assert 0 < len(part.strips) < len(whole.strips) / 2
+    before = kept()
+    with pytest.raises(MapError, match="cropping to"):
+        import_map(source, "elsewhere", Options(bbox=(1.0, 1.0, 2.0, 2.0)))
+    assert kept() == before
+
+
+@pytest.mark.engine
+def test_a_net_says_itself_where_it_drives(tmp_path: Path) -> None:
+    """--lefthand on a right-hand net is refused: it would turn the net into nonsense."""
+    source = tmp_path / "good.net.xml"
+    source.write_bytes(small_city())
+    with pytest.raises(MapError, match="on the right in this one"):
+        import_map(source, options=Options(lefthand=True))
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        pytest.param("a.osm", b"", "the file is empty", id="empty"),
+        pytest.param("a.osm", b"hello", "neither XML nor a known compression", id="text"),
+        pytest.param("a.osm", b"PK\x03\x04rest", "a zip archive", id="zip"),
+        pytest.param("a.osm", b"<html><body/></html>", "its root element is <html>", id="html"),
+        pytest.param("a.osm", b"<osm><node", "broken XML", id="cut short"),
+        pytest.param("a.osm", b"<osm/>", "none of them a street or path", id="no street"),
+        pytest.param("a.osm", osm((4.4e5, 5.8e6)).encode(), "reproject it to WGS 84", id="metres"),
+        pytest.param(
+            "a.osm",
+            osm(highway="trunk", sidewalk="").replace("footway", "motorway").encode(),
+            "nothing walkable",
+            id="motorways",
+        ),
+        pytest.param("a.osm", osm(blocks=0).encode(), "no street of the file survived", id="one point"),
+        pytest.param(
+            "a.osm.gz",
+            gzip.compress(osm().encode(), mtime=0)[:400],
+            "broken gzip file, probably cut short",
+            id="gzip cut short",
+        ),
+        pytest.param("a.osm.bz2", bz2.compress(osm().encode())[:300], "cut short", id="bzip2 cut short"),
+        pytest.param(
+            "a.osm.pbf", b"\x00\x00\x00\x0d\x0a\x09OSMHeader" + b"\x00" * 40, "cannot be unpacked (PBF)", id="no PBF"
+        ),
+        pytest.param("a.net.xml", b'<net version="1.20"/>', "0 edges", id="no edges"),
+        pytest.param("a.net.xml", b'<net version="1.20"><edge id="a">', "broken XML", id="net cut short"),
+        pytest.param(
+            "a.net.xml.gz", gzip.compress(b"<net>" * 99, mtime=0)[:20], "broken gzip file", id="gzip net cut short"
+        ),
+    ],
+)
+def test_bad_files_are_refused_and_leave_nothing(tmp_path: Path, name: str, content: bytes, reason: str) -> None:
+    """Whatever the file is, one MapError names it and says what was found, and nothing half-imported stays."""
+    before, source = kept(), tmp_path / name
+    source.write_bytes(content)
+    with pytest.raises(MapError) as caught:
+        import_map(source)
+    assert str(caught.value).startswith(f"{source}: ") and reason in str(caught.value)
+    assert kept() == before
+
+
+def test_missing_files_and_bad_names_are_refused(tmp_path: Path) -> None:
+    """A file that is not there, a name that is no name, a name that SUMO's nets have, a box that is none."""
+    with pytest.raises(MapError, match="cannot be read: No such file"):
+        import_map(tmp_path / "none.osm")
+    with pytest.raises(MapError, match="cannot be read: it is a folder, not a file"):
+        import_map(tmp_path)
+    with pytest.raises(UsageError, match="cannot name a map"):
+        import_map(tmp_path / "a.osm", "../a")
+    with pytest.raises(UsageError, match="comes with SUMO"):
+        import_map(tmp_path / "a.osm", "sumo-fkk-in")
+    with pytest.raises(UsageError, match="unknown map 'atlantis'"):
+        map_net(CityMap(map="atlantis"))
+    with pytest.raises(UsageError, match="west < east"):
+        Options(bbox=(2.0, 0.0, 1.0, 1.0))
+
+
+def test_names_come_from_files() -> None:
+    """Endings go, odd letters become dashes, names that say nothing give way to the folder's."""
+    assert map_name(Path("x/West Oakland.osm.bz2")) == "west-oakland"
+    assert map_name(Path("x/fokr_bs.net.xml.gz")) == "fokr_bs"
+    assert map_name(Path("/maps/Taipei/input.osm.gz")) == "taipei"
+    assert map_name(Path("/maps/七.osm")) == "map"
+
+
+@pytest.mark.engine
+def test_a_slow_netconvert_is_told_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A conversion that does not end is stopped; one line names the user's file and what to do."""
+    monkeypatch.setattr(importer, "TIMEOUT_S", 0.001)
+    source = written(tmp_path / "town.osm", osm())
+    with pytest.raises(MapError) as caught:
+        import_map(source)
+    assert str(caught.value) == f"{source}: netconvert did not end within 0.001 s: cut the area of interest out first"
+
+
+@pytest.mark.engine
+def test_nets_that_come_with_sumo_are_imported_when_used() -> None:
+    """They are listed, need no import, and a scenario made on another net is refused."""
+    assert known_maps()["sumo-fkk-in"].origin == "sumo"
+    assert about_map("sumo-fkk-in").licences[0].startswith("EPL-2.0")
+    assert not read_facts(map_net("sumo-fkk-in")).never_green
+    with pytest.raises(MapError, match="made on 0123"):
+        map_net(CityMap(map="sumo-fkk-in", net_hash="0123"))
+
+
+def test_crossings_that_never_have_green_get_a_phase() -> None:
+    """One phase more, in which only they go, with yellow before and time to clear the road after; others stay."""
+    net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="11"/></edge>
+      <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="5"/></edge>
+      <tlLogic id="J" type="static" programID="0" offset="0"><phase duration="30" state="GrG"/>
+      <phase duration="30" state="rrr"/><phase duration="20" state="Grr"/></tlLogic>
+      <connection from=":J_w0" to=":J_c0" tl="J" linkIndex="1"/>
+      <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
+    root = ET.fromstring(net)
+    assert walks_of(root).never == [":J_c0"]
+    assert mend_signals(root) == ["signals that never let people cross got a walk phase at the end of each cycle: J"]
+    added = [(p.get("duration"), p.get("state")) for p in root.iter("phase")][3:]
+    assert added == [("3", "yrr"), ("2", "rrr"), ("8", "rGr"), ("10", "rrr")]
+    assert walks_of(root).never == [] and mend_signals(root) == []
+    special = ET.fromstring(net.replace("static", "NEMA"))
+    assert "left as they are" in mend_signals(special)[0] and walks_of(special).never == [":J_c0"]
+
+
+def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> None:
+    """A walking area that crosses itself between two sidewalks becomes ground a robot can pass; a whole one stays."""
+    net = """<net version="1.9"><location convBoundary="0,0,30,9"/>
+      <edge id=":J_w0" function="walkingarea"><lane id=":J_w0_0" allow="pedestrian" length="4" width="2"
+        shape="10,-1 14,1 14,-1 10,1"/></edge>
+      <edge id=":K_w0" function="walkingarea"><lane id=":K_w0_0" allow="pedestrian" length="4" width="2"
+        shape="24,-1 28,-1 28,1 24,1"/></edge>
+      <edge id="a"><lane id="a_0" allow="pedestrian" length="10" width="2" shape="0,0 10,0"/></edge>
+      <edge id="b"><lane id="b_0" allow="pedestrian" length="10" width="2" shape="14,0 24,0"/></edge>
+      <edge id="c"><lane id="c_0" allow="pedestrian" length="10" width="2" shape="28,0 38,0"/></edge>
+      <connection from="a" to=":J_w0" fromLane="0" toLane="0"/><connection from=":J_w0" to="b" fromLane="0" toLane="0"/>
+      <connection from="b" to=":K_w0" fromLane="0" toLane="0"/><connection from=":K_w0" to="c" fromLane="0" toLane="0"/>
+      </net>"""
+    path = written(tmp_path / "torn.net.xml", net)
+    root, leave, enter = ET.fromstring(net), Port("a", 1), Port("b", 0)
+    assert read_net(path).corners[":J_w0"].polygon.buffer(-0.1).geom_type == "MultiPolygon"
+    assert mend_corners(root, read_net(path)) == [
+        "1 of 2 corners were torn or pinched: widened along the ways across them"
+    ]
+    path.write_bytes(ET.tostring(root))
+    mended = read_net(path)
+    assert through_corner(mended, leave, enter)[[0, -1]].tolist() == [[10.0, 0.0], [14.0, 0.0]]
+    assert mended.corners[":J_w0"].polygon.buffer(-0.4).geom_type == "Polygon"
+    assert [e[0].get("shape") for e in root if e.get("id") == ":K_w0"] == ["24,-1 28,-1 28,1 24,1"]
+    assert mend_corners(root, mended) == []
+
+
+@pytest.mark.engine
+def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
+    """import and check, their output and exit codes."""
+    source, picture = written(tmp_path / "town.osm", osm()), tmp_path / "town.png"
+    done = cosim("map", "import", str(source), "--name", "town")
+    assert done.returncode == 0 and "long-horizon scenarios possible" in done.stdout, done.stderr
+    assert "converting " in done.stderr and "checking town ..." in done.stderr
+    done = cosim("map", "check", "town", "--json", "-o", str(picture), "--zoom", "0,0,100,100")
+    assert done.returncode == 0 and json.loads(done.stdout)["check"]["corners"] > 10
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    done = cosim("map", "check", "nowhere")
+    assert done.returncode == 2 and "unknown map 'nowhere'" in done.stderr
+    cars = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
+    done = cosim("map", "check", str(cars))
+    assert done.returncode == 2 and "NOT USABLE" in done.stdout
+    done = cosim("map", "import", str(cars))
+    assert done.returncode == 2 and "--upgrade" in done.stderr and "Traceback" not in done.stderr
+
+
+def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
+    """The file with one of the usual damages."""
+    how = draw(st.sampled_from(("cut", "flip", "drop", "type", "none"))) if data else "none"
+    if how == "cut":
+        return data[: draw(st.integers(0, len(data)))]
+    if how == "none":
+        return data
+    if how == "flip":
+        spoilt = bytearray(data)
+        for at in draw(st.lists(st.integers(0, len(data) - 1), min_size=1, max_size=12)):
+            spoilt[at] ^= 1 << draw(st.integers(0, 7))
+        return bytes(spoilt)
+    names = sorted(set(re.findall(rb' ([A-Za-z]+)="', data)))
+    if not names:
+        return data
+    name = draw(st.sampled_from(names))
+    places = list(re.finditer(rb" " + name + rb'="([^"]*)"', data))
+    few = draw(st.booleans())
+    chosen = [places[draw(st.integers(0, len(places) - 1))]] if few else places
+    values = (b"", b"nan", b"-1", b"1e999", b"x y", b"0,0", b"1,1 1,1", "七".encode(), b"99999999999", b":", b"true")
+    value = b"" if how == "drop" else b" " + name + b'="' + draw(st.sampled_from(values)) + b'"'
+    for place in reversed(chosen):
+        data = data[: place.start()] + value + data[place.end() :]
+    return data
+
+
+@st.composite
+def spoiled_nets(draw: st.DrawFn) -> bytes:
+    """Damaged nets of a small city, packed or not."""
+    data = spoiled(draw, small_city())
+    return spoiled(draw, gzip.compress(data, 1)) if draw(st.integers(0, 5)) == 0 and data else data
+
+
+@st.composite
+def spoiled_osm(draw: st.DrawFn) -> bytes:
+    """Damaged OpenStreetMap files."""
+    return spoiled(draw, osm(blocks=2).encode())
+
+
+@settings(max_examples=100)
+@given(data=spoiled_nets())
+def test_reading_damaged_nets_ends_in_a_map_or_a_map_error(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes
+) -> None:
+    """read_net and read_facts raise MapError or succeed, whatever is in the file."""
+    path = tmp_path_factory.mktemp("net") / "spoiled.net.xml"
+    path.write_bytes(data)
+    for read in (read_net, read_facts):
+        try:
+            read(path)
+        except MapError as error:
+            assert str(path) in str(error)
+
+
+@pytest.mark.engine
+@settings(max_examples=12)
+@given(data=st.one_of(spoiled_nets(), spoiled_osm()), upgrade=st.booleans())
+def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, upgrade: bool
+) -> None:
+    """import_map raises MapError or keeps a whole map, never anything between."""
+    path, before = tmp_path_factory.mktemp("spoiled") / "spoiled.xml", kept()
+    path.write_bytes(data)
+    try:
+        import_map(path, "spoiled", Options(upgrade=upgrade))
+    except MapError:
+        assert kept() == before
+    else:
+        assert read_map("spoiled").strips
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
+@pytest.mark.parametrize("name", [n for n in NAMES if not n.startswith("zz-")])
+def test_shared_maps_import(name: str) -> None:
+    """Every open map imports with the walkable length that was measured, and can be used."""
+    stats = json.loads((MAPS / name / "stats.json").read_text())
+    raw = MAPS / name / stats["meta"]["raw"]
+    source = raw if raw.exists() else MAPS / name / stats["meta"]["net"]
+    about = import_map(source, name, Options(upgrade=name in CAR_ONLY))
+    _, check, _ = checked_map(name)
+    measured_km = stats[stats["meta"]["net"]]["stat"]["walkable_km"]
+    assert check.facts is not None and check.facts.walkable_km == pytest.approx(measured_km, rel=0.05)
+    assert check.walkable_km == pytest.approx(measured_km, rel=0.05)
+    assert check.usable and check.long_horizon_possible and about.licences
+    assert not check.facts.never_green
+
+
+@pytest.mark.engine
+@pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
+@pytest.mark.parametrize("name", [*CAR_ONLY, "zz-empty-roundabout"])
+def test_shared_maps_that_are_refused(name: str) -> None:
+    """Nets for cars alone without --upgrade, and the map of which nothing is left, are refused with the reason."""
+    meta = json.loads((MAPS / name / "stats.json").read_text())["meta"]
+    reason = "--upgrade" if name in CAR_ONLY else "no street of the file survived"
+    with pytest.raises(MapError, match=reason):
+        import_map(MAPS / name / meta["raw"], "refused")
+    assert "refused" not in kept()

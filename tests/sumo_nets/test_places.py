@@ -1,0 +1,247 @@
+"""Whatever a user calls a place can be run on: maps by name, folders of cities and maps, nets; and the store of maps
+holds whole ones only, whoever dies or comes at the same moment."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from cosim.core.errors import MapError, SpecError, UsageError
+from cosim.spec.events import GROUPS
+from cosim.spec.scenario import City, CityMap
+from scenarios.builders.sample import suite_on_map
+from scenarios.execution.places import place
+from sumo_nets.city.store import NET_NAME, write_city
+from sumo_nets.maps.mapstore import ABOUT, about_map, import_map, known_maps, map_net, maps_folder, read_map
+from sumo_nets.maps.place_names import place_called
+from sumo_nets.maps.scratch import HELD, PREFIX, move_in, scratch_in
+from tests.conftest import PATIENCE_S, Cosim
+from tests.test_damaged_maps import TOWN
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Maps are kept in a folder of this module's own."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+    place.cache_clear()
+
+
+@pytest.fixture(scope="module")
+def city(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of `cosim city make`."""
+    folder = tmp_path_factory.mktemp("cities") / "seven"
+    write_city(City(seed=7, size_m=400.0), folder)
+    return folder
+
+
+def test_what_is_no_place_is_told_with_what_there_is(tmp_path: Path) -> None:
+    """An unknown name, a folder of something else and a file that must be imported first: each with the remedy."""
+    with pytest.raises(UsageError, match=r"unknown map 'nowhere'.*sumo-fkk-in.*Or give a path: the folder of"):
+        place_called("nowhere")
+    with pytest.raises(UsageError, match=r"a folder without city\.json or about\.json"):
+        place_called(str(tmp_path))
+    town = tmp_path / "town.osm"
+    town.write_text(TOWN)
+    with pytest.raises(UsageError, match=r"import it first with `cosim map import .*town\.osm`"):
+        place_called(str(town))
+    os.mkfifo(tmp_path / "pipe.net.xml")
+    with pytest.raises(MapError, match="it is a pipe, not a file"):
+        place_called(str(tmp_path / "pipe.net.xml"))
+    (tmp_path / "city.json").write_text('{"city": 7}')
+    with pytest.raises(MapError, match=r"city\.json: cannot be read: .*make the city again"):
+        place_called(str(tmp_path))
+
+
+def test_suites_that_cannot_be_drawn_are_refused() -> None:
+    """Another kind of suite, or an event that does not exist, with the valid ones; before any map is looked for."""
+    with pytest.raises(UsageError, match=r"suite for --map 'unit'\. Valid choices: long-horizon, reactive"):
+        suite_on_map("unit", "nowhere", 0, 1)
+    with pytest.raises(UsageError, match=r"event 'ambush'\. Valid choices: .*frontal"):
+        suite_on_map("reactive", "nowhere", 0, 1, events=["ambush"])
+
+
+def test_names_that_lead_out_of_the_store_are_unknown() -> None:
+    """A scenario cannot name a map by a way through folders."""
+    for name in ("../other", "..", "a/b", "", "/etc"):
+        with pytest.raises(UsageError, match="unknown map"):
+            map_net(CityMap(map=name))
+
+
+@pytest.mark.engine
+def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
+    """It is the same place as by its seed, with the hash of its net, so that a run of it needs no folder."""
+    where = place_called(str(city), roughness=0.2)
+    assert where == place_called(str(city / NET_NAME), roughness=0.2)
+    assert isinstance(where, City) and (where.seed, where.size_m, where.unevenness) == (7, 400.0, 0.2)
+    for kind in ("long-horizon", "reactive"):
+        one, again = (suite_on_map(kind, str(city), 3, 2) for _ in range(2))
+        assert one == again and len(one.scenarios) == 2
+        assert all(s.place == City(seed=7, size_m=400.0, net_hash=where.net_hash) for s in one.scenarios)
+
+
+@pytest.mark.engine
+def test_a_changed_city_is_a_map(city: Path, tmp_path: Path) -> None:
+    """When its net is not the one of its seed any more, the folder's net is what is run on; it is imported once."""
+    mine = tmp_path / "mine"
+    shutil.copytree(city, mine)
+    net = (mine / NET_NAME).read_text()
+    (mine / NET_NAME).write_text(re.sub(r' speed="\d[\d.]*"', ' speed="7.77"', net))
+    where = place_called(str(mine))
+    assert isinstance(where, CityMap) and about_map(where.map).source == NET_NAME
+    began = (maps_folder() / where.map / ABOUT).stat().st_mtime_ns
+    assert place_called(str(mine)) == where
+    assert (maps_folder() / where.map / ABOUT).stat().st_mtime_ns == began
+    (scenario,) = suite_on_map("long-horizon", str(mine), 0, 1).scenarios
+    assert isinstance(scenario.place, CityMap) and scenario.place.net_hash == read_map(where.map).net_hash
+
+
+@pytest.mark.engine
+def test_nets_and_folders_of_maps_are_imported_under_a_name(city: Path, tmp_path: Path) -> None:
+    """A net gets its file's name, another of that name one with its hash; a map's folder brings its buildings along."""
+    net, other = tmp_path / "street.net.xml", tmp_path / "b" / "street.net.xml"
+    shutil.copy(city / NET_NAME, net)
+    other.parent.mkdir()
+    other.write_bytes(net.read_bytes() + b"<!-- another file -->\n")
+    assert place_called(str(net)) == CityMap(map="street") == place_called(str(net)) == place_called("street")
+    second = place_called(str(other))
+    assert isinstance(second, CityMap) and second.map.startswith("street-") and second.map in known_maps()
+    house = '<way id="400"><nd ref="5"/><nd ref="6"/><nd ref="7"/><nd ref="5"/><tag k="building" v="yes"/></way>'
+    spots = [(5, 13.4005, 52.5005), (6, 13.4009, 52.5005), (7, 13.4009, 52.5008)]
+    nodes = "".join(f'<node id="{n}" lon="{lon}" lat="{lat}"/>' for n, lon, lat in spots)
+    (tmp_path / "town.osm").write_text(
+        TOWN.replace('<way id="100">', nodes + '<way id="100">').replace("</osm>", house + "</osm>")
+    )
+    about = import_map(tmp_path / "town.osm")
+    assert {f.kind for f in read_map("town").features} == {"building"}
+    assert place_called(str(maps_folder() / "town")) == CityMap(map="town")
+    elsewhere = tmp_path / "kept"
+    shutil.move(maps_folder() / "town", elsewhere)
+    assert place_called(str(elsewhere)) == CityMap(map="town") and read_map("town").net_hash == about.net_hash
+    assert {f.kind for f in read_map("town").features} == {"building"}
+    (elsewhere / "net.xml").write_text((elsewhere / "net.xml").read_text().replace("13.89", "13.88"))
+    with pytest.raises(MapError, match="it was changed since; import the changed net"):
+        place_called(str(elsewhere))
+
+
+@pytest.mark.engine
+def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
+    """Events take turns over the seeds; those without room are left out and named, unless they were asked for."""
+    whole = suite_on_map("reactive", "sumo-fkk-in", 0, None)
+    kinds = [s.events[0].kind for s in whole.scenarios]
+    left_out = [kind for kind in GROUPS if f"No '{kind}'" in whole.description]
+    assert kinds and left_out and sorted([*kinds, *left_out]) == sorted(GROUPS)
+    some = suite_on_map("reactive", "sumo-fkk-in", 5, 3, events=kinds[:2])
+    assert [s.events[0].kind for s in some.scenarios] == [kinds[0], kinds[1], kinds[0]]
+    assert len({s.id for s in some.scenarios}) == 3 and all(s.place.net_hash for s in some.scenarios)
+    with pytest.raises(SpecError, match=f"no place for '{left_out[0]}' on 'sumo-fkk-in'"):
+        suite_on_map("reactive", "sumo-fkk-in", 0, 1, events=[left_out[0]])
+
+
+@pytest.mark.engine
+def test_a_run_on_a_city_of_ones_own_is_replayed(cosim: Cosim, city: Path) -> None:
+    """`cosim run reactive --map FOLDER` runs, and its replay gives the recorded hash from the run's folder alone."""
+    words = ("--map", "seven", "--event", "frontal", "--policy", "straight", "--out", "run")
+    said = cosim("run", "reactive", *words, cwd=city.parent)
+    assert said.returncode == 0, said.stderr
+    (episode,) = (p.name for p in (city.parent / "run" / "episodes").iterdir())
+    assert episode == "frontal-city-mixed-400m-7-000"
+    shutil.move(city, city.parent / "gone")
+    try:
+        again = cosim("replay", "run", episode, cwd=city.parent)
+        assert again.returncode == 0 and "as recorded" in again.stdout + again.stderr
+    finally:
+        shutil.move(city.parent / "gone", city)
+    check = cosim("map", "check", "seven", cwd=city.parent)
+    assert check.returncode == 0 and "long-horizon scenarios possible" in check.stdout
+
+
+def test_what_a_dead_process_left_is_swept_away(tmp_path: Path) -> None:
+    """A scratch folder that nobody holds is removed by the next one, one that is held stays."""
+    with scratch_in(tmp_path) as held:
+        (tmp_path / f"{PREFIX}dead").mkdir()
+        (tmp_path / f"{PREFIX}dead" / HELD).touch()
+        with scratch_in(tmp_path) as other:
+            assert {p.name for p in tmp_path.glob(f"{PREFIX}*")} == {held.name, other.name}
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_map_that_was_being_replaced_when_its_process_died_is_put_back(tmp_path: Path) -> None:
+    """Between the old map's going and the new one's coming nothing is lost."""
+    dead = tmp_path / "maps" / f"{PREFIX}dead"
+    (dead / "old" / "town").mkdir(parents=True)
+    (dead / "old" / "town" / "net.xml").write_text("<net/>")
+    (dead / HELD).touch()
+    with scratch_in(tmp_path / "maps"):
+        assert (tmp_path / "maps" / "town" / "net.xml").read_text() == "<net/>"
+
+
+def test_a_finished_folder_takes_the_place_of_the_old_one(tmp_path: Path) -> None:
+    """Moved in, the new one is there whole; where it may not take the place, the old one stays."""
+    for number, in_place in enumerate((True, True, False)):
+        with scratch_in(tmp_path / "maps") as scratch:
+            (scratch / "ready").mkdir()
+            (scratch / "ready" / "net.xml").write_text(str(number))
+            move_in(scratch / "ready", tmp_path / "maps" / "town", in_place=in_place)
+    assert [p.name for p in (tmp_path / "maps").iterdir()] == ["town"]
+    assert (tmp_path / "maps" / "town" / "net.xml").read_text() == "1"
+
+
+def test_a_reader_waits_while_a_map_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A map that is gone for the moment of its replacement is not unknown to who asks just then."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    net = maps_folder() / "town" / "net.xml"
+    waited = []
+
+    def locked(_file: object, how: int) -> None:
+        waited.append(how)
+        net.parent.mkdir(parents=True)
+        net.write_text("<net/>")
+
+    monkeypatch.setattr(fcntl, "flock", locked)
+    assert map_net("town") == net and waited == [fcntl.LOCK_EX]
+
+
+IMPORTER = """
+import sys
+from pathlib import Path
+from sumo_nets.maps.mapstore import import_map, read_map
+for _ in range(2):
+    import_map(Path(sys.argv[1]), "shared")
+    assert read_map("shared").strips
+"""
+
+
+@pytest.mark.engine
+def test_two_processes_import_one_name_at_once(tmp_path: Path) -> None:
+    """Each ends well and reads a whole map at any moment; one whole map is left, and no scratch folder."""
+    (tmp_path / "town.osm").write_text(TOWN)
+    before = sorted(p.name for p in maps_folder().glob("*"))
+    command = [sys.executable, "-c", IMPORTER, str(tmp_path / "town.osm")]
+    both = [subprocess.Popen(command, stderr=subprocess.PIPE, text=True) for _ in range(2)]
+    for process in both:
+        _, said = process.communicate(timeout=PATIENCE_S)
+        assert process.returncode == 0, said
+    assert sorted(p.name for p in maps_folder().glob("*")) == sorted({*before, "shared"})
+    assert about_map("shared").net_hash == read_map("shared").net_hash
+
+
+def test_a_damaged_map_does_not_hide_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The list shows it as damaged; a name that is unknown is still answered with those that are known."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    (maps_folder() / "broken").mkdir(parents=True)
+    (maps_folder() / "broken" / "net.xml").write_text("<net/>")
+    (maps_folder() / "broken" / ABOUT).write_bytes(msgspec.json.encode({"name": 1}))
+    assert known_maps()["broken"].source == "damaged: import it again" and "sumo-fkk-in" in known_maps()
+    with pytest.raises(UsageError, match=r"unknown map 'x'\. Valid choices: broken, sumo-"):
+        place_called("x")

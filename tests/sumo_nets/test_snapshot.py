@@ -1,0 +1,91 @@
+"""Snapshots of street maps: what was read is what comes back, and nothing depends on them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+
+from cosim.core.errors import MapError
+from cosim.spec.scenario import City
+from sumo_nets.city.store import city_net
+from sumo_nets.net.netfile import read_net
+from sumo_nets.net.snapshot import FOLDER, frozen, street_map_of, thawed
+
+
+@pytest.fixture(scope="module")
+def net() -> Path:
+    return city_net(City(seed=3, size_m=300.0))
+
+
+@pytest.fixture
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache" / FOLDER
+
+
+def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
+    """Ids, numbers, lines and polygons come back equal to the bit, in the same order."""
+    read = read_net(net)
+    back = thawed(frozen(read))
+    assert frozen(back) == frozen(read)
+    assert (back.name, back.bounds, back.net_hash, back.left_hand) == (
+        read.name,
+        read.bounds,
+        read.net_hash,
+        read.left_hand,
+    )
+    assert list(back.strips) == list(read.strips) and list(back.lanes) == list(read.lanes)
+    for name, strip in read.strips.items():
+        again = back.strips[name]
+        assert np.array_equal(again.line, strip.line)
+        assert shapely.equals_exact(again.polygon, strip.polygon, 0.0)
+        assert (again.corners, again.driveways, again.width_m) == (strip.corners, strip.driveways, strip.width_m)
+    for name, corner in read.corners.items():
+        assert back.corners[name].ports == corner.ports
+        assert type(back.corners[name].polygon) is type(corner.polygon)
+
+
+def test_the_second_reading_comes_from_the_snapshot(net: Path, cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once a snapshot lies there the net itself is not parsed again."""
+    first = street_map_of(net)
+    assert len(list(cache.iterdir())) == 1
+    monkeypatch.setattr("sumo_nets.net.snapshot.read_net", lambda _: pytest.fail("parsed again"))
+    assert frozen(street_map_of(net)) == frozen(first)
+
+
+def test_a_damaged_snapshot_is_made_anew(net: Path, cache: Path) -> None:
+    """A flipped bit or a cut file costs a reading, not a wrong map."""
+    whole = frozen(street_map_of(net))
+    (kept,) = cache.iterdir()
+    sound = kept.read_bytes()
+    flipped = bytearray(sound)
+    flipped[len(sound) // 2] ^= 16
+    for bad in (bytes(flipped), sound[:1000], b""):
+        kept.write_bytes(bad)
+        assert frozen(street_map_of(net)) == whole
+        assert kept.read_bytes() == sound
+
+
+def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path) -> None:
+    """The net's bytes are part of a snapshot's name: an edited net is never answered from an old one."""
+    street_map_of(net)
+    edited = tmp_path / net.name
+    edited.write_bytes(net.read_bytes().replace(b'"frontage_m" value="', b'"frontage_m" value="1'))
+    assert frozen(street_map_of(edited)) != frozen(street_map_of(net))
+    assert len(list(cache.iterdir())) == 2
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The map is read all the same."""
+    (tmp_path / "file").write_text("in the way")
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
+    assert frozen(street_map_of(net)) == frozen(read_net(net))
+
+
+def test_a_missing_net_is_an_error_that_names_it(tmp_path: Path, cache: Path) -> None:
+    """The reader's own message, not the cache's."""
+    with pytest.raises(MapError, match="nowhere"):
+        street_map_of(tmp_path / "nowhere.net.xml")
