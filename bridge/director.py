@@ -32,15 +32,6 @@ LONGEST_REASON = 500
 T = TypeVar("T", bound=msgspec.Struct)
 
 
-class Outside(msgspec.Struct, frozen=True, kw_only=True):
-    """A director in a process of its own. endpoint: where it listens; run: the run's name in the keys; wait_s: how long
-    an episode waits for it before it is recorded as crashed."""
-
-    endpoint: str
-    run: str
-    wait_s: float
-
-
 class Signed(msgspec.Struct, frozen=True):
     """by: the version of the behaviours of whoever sends it."""
 

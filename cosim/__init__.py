@@ -1,0 +1,83 @@
+"""cosim: a benchmark for robots that deliver on sidewalks.
+
+This is its public face; what is not listed here is private. Names are loaded when they are first used: importing cosim
+starts no engine and imports none.
+
+    suite = cosim.load_suite("reactive")
+    table = cosim.run(suite, "orca", episodes=2)
+
+or, holding an episode oneself:
+
+    with cosim.Episode(suite.scenarios[0], policy.manifest) as episode:
+        policy.reset(episode.scenario.id, episode.scenario.seed)
+        observation = episode.reset()
+        while not episode.over:
+            observation = episode.advance(policy.act(observation))
+    record, log = episode.result()
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from cosim.core.errors import CosimError
+    from cosim.core.state import Command
+    from cosim.episode.log import Log
+    from cosim.episode.ports import CameraSpec, Manifest, Observation, Policy
+    from cosim.policies.load import load_policy
+    from cosim.records.record import Record
+    from cosim.spec.options import EpisodeOptions
+    from cosim.spec.scenario import Scenario, Suite
+    from scenarios.catalog import load_suite
+    from scenarios.execution.episode import Episode
+    from scenarios.execution.suite_run import run
+
+__all__ = [
+    "CameraSpec",
+    "Command",
+    "CosimError",
+    "Episode",
+    "EpisodeOptions",
+    "Log",
+    "Manifest",
+    "Observation",
+    "Policy",
+    "Record",
+    "Scenario",
+    "Suite",
+    "load_policy",
+    "load_suite",
+    "run",
+]
+
+_HOMES = {
+    "CameraSpec": "cosim.episode.ports",
+    "Command": "cosim.core.state",
+    "CosimError": "cosim.core.errors",
+    "Episode": "scenarios.execution.episode",
+    "EpisodeOptions": "cosim.spec.options",
+    "Log": "cosim.episode.log",
+    "Manifest": "cosim.episode.ports",
+    "Observation": "cosim.episode.ports",
+    "Policy": "cosim.episode.ports",
+    "Record": "cosim.records.record",
+    "Scenario": "cosim.spec.scenario",
+    "Suite": "cosim.spec.scenario",
+    "load_policy": "cosim.policies.load",
+    "load_suite": "scenarios.catalog",
+    "run": "scenarios.execution.suite_run",
+}
+"""The module of each public name (PEP 562: loaded on demand)."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'cosim' has no attribute '{name}'. It has: {', '.join(__all__)}")
+    value = globals()[name] = getattr(import_module(_HOMES[name]), name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

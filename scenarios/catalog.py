@@ -16,7 +16,7 @@ _HERE = Path(__file__).parent / "suites"
 SUITES: Mapping[str, Path] = MappingProxyType({name: _HERE / f"{name}.json" for name in ("long-horizon", "reactive")})
 
 
-def suite(name: str) -> Suite:
+def load_suite(name: str) -> Suite:
     """A shipped suite by name, or one of the user's by the path of its .json file.
 
     Raises UsageError with the valid names, SpecError naming the file and the field.
@@ -32,7 +32,7 @@ def holding(scenario_id: str) -> Suite:
     """The shipped suite with a scenario of this id. Raises UsageError with the valid names."""
     ids: list[str] = []
     for name in SUITES:
-        whole = suite(name)
+        whole = load_suite(name)
         if scenario_id in (here := [s.id for s in whole.scenarios]):
             return whole
         ids += here

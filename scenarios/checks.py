@@ -19,8 +19,8 @@ from cosim.spec.events import EventQuery
 from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.cameras.choice import chosen, renderer_of
 from scenarios.builders.long_horizon import build
-from scenarios.execution.assemble import staged
 from scenarios.execution.directing import directed
+from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
 from sumo_nets.city.store import cache_folder
 
@@ -74,16 +74,13 @@ def cameras() -> str:
 def frame() -> str:
     """One frame and one step of a small city, with crowd and physics."""
     scenario = small_scenario()
-    with staged(scenario, Straight()) as stage:
-        parts = stage.parts
-        robot = parts.world.place(scenario.start_pose)
-        assert parts.camera is not None
-        picture = parts.camera.render(robot, parts.crowd.street)
-        if len(np.unique(picture.rgb.reshape(-1, 3), axis=0)) < 5:
+    with Episode(scenario, Straight.manifest) as episode:
+        picture = episode.reset().rgb
+        if picture is None or len(np.unique(picture.reshape(-1, 3), axis=0)) < 5:
             raise EngineError("the camera's picture is blank")
-        height, width, _ = picture.rgb.shape
-        people = len(parts.crowd.street.people)
-        return f"SUMO walks {people} people, PyBullet holds the robot, {stage.renderer} draws {width}x{height}"
+        height, width, _ = picture.shape
+        people, renderer = len(episode.moment.street.people), episode.record.renderer
+        return f"SUMO walks {people} people, PyBullet holds the robot, {renderer} draws {width}x{height}"
 
 
 def small_scenario() -> Scenario:

@@ -189,9 +189,9 @@ def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
 
 
 def _driven(scenario: Scenario, seed: int) -> Fate:
-    from scenarios.execution.run import episode
+    from scenarios.execution.run import run_episode
 
-    outcome = episode(msgspec.structs.replace(scenario, time_limit_s=DRIVEN_S), Ahead())
+    outcome = run_episode(msgspec.structs.replace(scenario, time_limit_s=DRIVEN_S), Ahead())
     record = outcome.record
     if record.status != "crashed":
         return Fate(seed, "driven", record.state_hash)

@@ -53,7 +53,7 @@ def test_every_id_can_be_read(twice: list[list[str]]) -> None:
 def test_no_test_waits_for_a_time_of_its_own() -> None:
     """Who waits for something to happen waits PATIENCE_S: a number of seconds is too short on some machine."""
     found = []
-    for path in sorted((ROOT / "tests").glob("*.py")):
+    for path in sorted((ROOT / "tests").rglob("*.py")):
         for call in ast.walk(ast.parse(path.read_text())):
             limits = [k.value for k in call.keywords if k.arg == "timeout"] if isinstance(call, ast.Call) else []
             found += [f"{path.name}:{limit.lineno}" for limit in limits if isinstance(limit, ast.Constant)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import configparser
 import re
 import subprocess
 import sys
@@ -72,3 +73,18 @@ def test_the_fake_names_of_files_are_not_to_be_found() -> None:
         for path in (ROOT / room).rglob("*.py"):
             assert path.stem not in ("utils", "common", "helpers", "manager", "misc")
             assert len(path.read_text().splitlines()) <= 400, path
+
+
+def test_architecture_shows_the_floors_that_are_enforced() -> None:
+    """The picture of the floors is the layers of `.importlinter`, line by line."""
+    contracts = configparser.ConfigParser()
+    contracts.read(ROOT / ".importlinter")
+    layers = [contracts[f"importlinter:contract:{name}"]["layers"].strip() for name in ("floors", "scenarios")]
+    assert f"```\n{chr(10).join([layers[0], '', layers[1]])}\n```" in (ROOT / "ARCHITECTURE.md").read_text()
+
+
+def test_no_folder_is_flat_and_endless() -> None:
+    """No folder of the product holds more than 20 modules."""
+    for room in ROOMS:
+        for folder in (ROOT / room, *(path for path in (ROOT / room).rglob("*") if path.is_dir())):
+            assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 20, folder

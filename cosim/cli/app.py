@@ -111,21 +111,18 @@ def run(
 ) -> None:
     """Run a suite with a policy and print its table."""
     from bridge import keys
-    from bridge.director import Outside
     from bridge.session import Session
     from cosim.cli.tables import kinds_of, print_by_kind, print_table
-    from cosim.core.versions import versions
     from cosim.policies.load import load_policy
-    from cosim.records.record import NO_RENDERER
-    from cosim.records.run_folder import RunFolder, RunSpec
+    from cosim.records.run_folder import RunFolder
     from cosim.spec.injection import Live
-    from physics.cameras.choice import renderer_of
+    from cosim.spec.options import EpisodeOptions, Outside
     from scenarios.builders.fits import LOOKING, check_places
-    from scenarios.catalog import chosen, with_crowd
-    from scenarios.catalog import suite as shipped
+    from scenarios.catalog import chosen, load_suite, with_crowd
     from scenarios.execution.asked import Patience
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
+    from scenarios.execution.suite_run import run_spec
 
     if map_name is not None:
         from scenarios.builders.sample import suite_on_map
@@ -136,25 +133,12 @@ def run(
     elif roughness is not None:
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
-        whole = shipped(suite)
+        whole = load_suite(suite)
     whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
     picked = chosen(whole, scenario or (), episodes, event or ())
     loaded = load_policy(policy)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
-    spec = RunSpec(
-        suite=whole.name,
-        suite_version=whole.version,
-        suite_hash=whole.content_hash,
-        policy=policy,
-        policy_name=manifest.name,
-        policy_version=manifest.version,
-        policy_source=loaded.source_hash,
-        scenarios=tuple(s.id for s in picked),
-        versions=versions(),
-        renderer=renderer_of(drawn_by) if manifest.camera is not None else NO_RENDERER,
-        counterfactual=counterfactual,
-    )
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -166,6 +150,15 @@ def run(
     if director is not None:
         endpoint = checked_endpoint(director, "--director")
         outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
+    options = EpisodeOptions(
+        suite_hash=whole.content_hash,
+        camera=drawn_by,
+        frames_every_s=frames,
+        live=on_air,
+        director=outside,
+        counterfactual=counterfactual,
+    )
+    spec = run_spec(whole, picked, policy, loaded, options)
     with ExitStack() as stack:
         if on_air is not None:
             stack.enter_context(Session.hub(on_air.endpoint))
@@ -191,10 +184,7 @@ def run(
                     loaded,
                     jobs=jobs,
                     tell=board.tell,
-                    frames_every_s=frames,
-                    camera=drawn_by,
-                    live=on_air,
-                    outside=outside,
+                    options=options,
                     patience=Patience(answer_timeout, start_timeout),
                 )
         except KeyboardInterrupt:
@@ -221,19 +211,18 @@ def list_all(
     """List the suites and policies, or the scenarios of a suite."""
     from cosim.cli.tables import print_scenarios
     from cosim.policies import POLICIES
-    from scenarios.catalog import SUITES
-    from scenarios.catalog import suite as shipped
+    from scenarios.catalog import SUITES, load_suite
 
     if suite is None:
         for name in SUITES:
-            whole = shipped(name)
+            whole = load_suite(name)
             out.print(
                 f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}"
             )
         for name, make in POLICIES.items():
             out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
         return
-    print_scenarios(out, shipped(suite))
+    print_scenarios(out, load_suite(suite))
 
 
 @app.command(

@@ -55,14 +55,13 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import chosen, holding, with_crowd
-    from scenarios.catalog import suite as shipped
+    from scenarios.catalog import chosen, holding, load_suite, with_crowd
     from scenarios.viewing.look import look
 
     picked = view_of(view)
     pixels = size_of(size)
     check_picture(output)
-    found = holding(scenario) if suite is None else shipped(suite)
+    found = holding(scenario) if suite is None else load_suite(suite)
     whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
     (one,) = chosen(whole, [scenario])
     with doing("choosing the camera") as tell:

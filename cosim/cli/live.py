@@ -27,7 +27,8 @@ DIRECTOR = "tcp/127.0.0.1:7448"
 SEARCH_S = 1.0
 PAUSE_S = 0.5
 LONGEST_WAIT_S = 240.0
-"""For a director: an environment process that says nothing for much longer is taken to hang (`scenarios.execution.pool`)."""
+"""For a director: an environment process that says nothing for much longer is taken to hang
+(`scenarios.execution.pool`)."""
 
 Connect = Annotated[str, typer.Option(help="The endpoint that the run was given as --live.")]
 Env = Annotated[str | None, typer.Option(help="Which episode, as RUN/EPISODE; needed when several run.")]

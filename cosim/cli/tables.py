@@ -155,7 +155,8 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
-    """What was measured of each event of a run (`scenarios.viewing.eventsheet`), and two summaries by kind: for 80 columns."""
+    """What was measured of each event of a run (`scenarios.viewing.eventsheet`), and two summaries by kind: for 80
+    columns."""
     from scenarios.viewing.eventsheet import summary
 
     heads = ("trigger\nm", "error\nm", "tick\nm", "speed\nm/s", "stated\nm/s", "left\nm", "angle\ndeg", "least\nm")

@@ -52,10 +52,9 @@ class People:
     """Pedestrians of a moment. ids: N unique names, sorted; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
 
     strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
-    shows, which follows the speed as one starts and stops (`cosim.people.gait`). Both are for pictures: nothing else reads
-    them. Background walkers have ids that start with "c", event pedestrians with "e",
-    residents (`CrowdSpec.residents`) with "n".
-    """
+    shows, which follows the speed as one starts and stops (`cosim.people.gait`). Both are for pictures: nothing else
+    reads them. Background walkers have ids that start with "c", event pedestrians with "e", residents
+    (`CrowdSpec.residents`) with "n"."""
 
     ids: tuple[str, ...]
     xy: Floats

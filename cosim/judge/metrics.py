@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.episode.log import Log
 from cosim.judge.referee import Failure
-from cosim.records.record import Ended, Log
+from cosim.records.record import Ended
 
 SCHEMA = 2
 """Raised whenever a definition changes; results of different schemas are not compared."""
@@ -204,8 +205,8 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
 COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
     {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}
 )
-"""Name -> unit of what is measured against the same street without the robot (`cosim.judge.delay`), when that is asked for:
-delay of those that came near the robot, summed, and how many they were. No part of any other episode."""
+"""Name -> unit of what is measured against the same street without the robot (`cosim.judge.delay`), when that is asked
+for: delay of those that came near the robot, summed, and how many they were. No part of any other episode."""
 
 
 def measure(episode: Episode) -> dict[str, float | None]:

@@ -2,9 +2,8 @@
 
 ORCA alone stops before somebody who stands in the way and stays there. So the wanted velocity is turned first to the
 nearest heading that is open for a while (RVO's choice among velocities: J. van den Berg, M. Lin, D. Manocha,
-"Reciprocal velocity obstacles for real-time multi-agent navigation", ICRA 2008); the half-planes of `cosim.people.orca` then
-share the avoidance between those who see each other, and slow down who finds nothing open.
-"""
+"Reciprocal velocity obstacles for real-time multi-agent navigation", ICRA 2008); the half-planes of `cosim.people.orca`
+then share the avoidance between those who see each other, and slow down who finds nothing open."""
 
 from __future__ import annotations
 

@@ -1,10 +1,9 @@
 """Nobody walks into the robot: how a person steps round it.
 
 SUMO's walkers see the robot as stripes, and at the edge of a crossing or corner they sometimes walk through it; our own
-people see other people (`cosim.people.steering`), the robot they see here. A person goes where it wants to go, but slides
-round the robot's outline instead of entering it. Only the person's own motion is changed: a robot that drives at
-somebody still hits them.
-"""
+people see other people (`cosim.people.steering`), the robot they see here. A person goes where it wants to go, but
+slides round the robot's outline instead of entering it. Only the person's own motion is changed: a robot that drives at
+somebody still hits them."""
 
 from __future__ import annotations
 

@@ -8,18 +8,16 @@ from __future__ import annotations
 
 import hashlib
 import os
-import zipfile
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 from cosim.core.versions import versions
+from cosim.episode.log import Log
 from cosim.episode.ports import Manifest
 from cosim.episode.step import Step
 from cosim.judge.referee import Failure, Verdict
@@ -35,76 +33,11 @@ Status = Literal["done", "crashed", "invalid"]
 Ended = Literal["goal", "stop", "timeout", "failure"]
 
 
-@dataclass(frozen=True)
-class Log:
-    """An episode tick by tick, T rows; values at the end of each tick.
-
-    pose (T, 3) x m, y m, heading rad; speed (T, 2) v m/s, w rad/s; command (T, 2) likewise; route_s_m (T,);
-    travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
-    reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
-    on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.judge.traffic`.
-    people_tick (P,), people_xy (P, 2), people_event, people_resident (P,) bool: persons within 30 m, once a second,
-    for pictures.
-    event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
-    """
-
-    tick_s: float
-    pose: Floats
-    speed: Floats
-    command: Floats
-    route_s_m: Floats
-    travelled_m: Floats
-    person_m: Floats
-    reset_s_m: Floats
-    waits_at_red: NDArray[np.bool_]
-    on_carriageway: NDArray[np.bool_]
-    vehicles_braked: NDArray[np.int64]
-    people_tick: NDArray[np.int64]
-    people_xy: Floats
-    people_event: NDArray[np.bool_]
-    people_resident: NDArray[np.bool_]
-    event_tracks: Floats
-
-    def __len__(self) -> int:
-        return len(self.pose)
-
-    def row(self, tick: int) -> Floats:
-        """(14,) the values of a tick, in the order of `row_of`."""
-        columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
-        more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
-        return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)
-
-    def save(self, path: Path) -> None:
-        """Write as .npz, whole or not at all."""
-        temporary = path.with_name(path.name + ".part")
-        with temporary.open("wb") as file:
-            arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-
-    @classmethod
-    def load(cls, path: Path) -> Log:
-        """Read a saved log. Raises RunError naming the file."""
-        try:
-            with np.load(path, allow_pickle=False) as arrays:
-                held = dict(arrays)
-                # Logs from before there were residents do not mention them.
-                held.setdefault("people_resident", np.zeros(len(held["people_event"]), dtype=bool))
-                values = {name: held[name] for name in (f.name for f in fields(cls))}
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-            raise RunError(f"{path}: not a trajectory: {error}") from error
-        values["tick_s"] = float(values["tick_s"])
-        return cls(**values)
-
-
 class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
     """What became of an event. triggered_at_s and trigger_distance_m are absent if its trigger never fired.
 
-    seen: one of its people was before the robot once (`cosim.judge.event_monitor`). rule_met: whether the robot kept the event's
-    rule; absent where there is none.
-    """
+    seen: one of its people was before the robot once (`cosim.judge.event_monitor`). rule_met: whether the robot kept
+    the event's rule; absent where there is none."""
 
     id: str
     kind: str

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
+from cosim.episode.log import Log
 from cosim.place.street_map import Lane, StreetMap
-from cosim.records.record import Log, Record
+from cosim.records.record import Record
 from cosim.report.legend import Colour, Image, legend, wide_px
 from cosim.spec.scenario import Scenario
 

@@ -6,9 +6,10 @@ OpenGL and PyBullet are imported when a camera of theirs is asked for.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from cosim.episode.ports import CameraSpec
+from cosim.spec.options import CameraChoice, CameraName
 from cosim.spec.scenario import Light
 from physics.cameras.gl import context
 
@@ -16,9 +17,6 @@ if TYPE_CHECKING:
     from physics.cameras.bullet_camera import BulletCamera
     from physics.cameras.gl.camera import GlCamera
     from physics.world.world import BulletWorld
-
-CameraName = Literal["gl", "bullet", "bullet-egl"]
-CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
 
 
 def chosen(choice: CameraChoice) -> CameraName:

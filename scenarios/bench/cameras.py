@@ -20,8 +20,8 @@ from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.core.state import Doing, People, RobotState, Street, Vehicles
 from cosim.episode.ports import CameraSpec
 from cosim.place.street_map import StreetMap
+from cosim.spec.options import CameraName
 from cosim.spec.scenario import City
-from physics.cameras.choice import CameraName
 
 SIZE: Final = (512, 288)
 PERSONS: Final = 50
@@ -95,11 +95,11 @@ def place_of(size_m: float) -> StreetMap:
 def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) -> float:
     """Median seconds of a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back."""
     from physics.cameras.choice import camera_of
-    from physics.world.world import BulletWorld
+    from scenarios.execution.wiring import world_of
 
     street_map = place_of(size_m)
+    world = world_of(street_map, 5)
     busy = busy_street(street_map, persons, frames)
-    world = BulletWorld(street_map, 5, (), "courier")
     with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
         return _median(lambda street: eyes.render(busy.robot, street), busy.streets)
 
@@ -122,11 +122,11 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
 def together(environments: int, frames: int, size_m: float) -> float:
     """Median seconds of one environment's picture where several are drawn into one atlas and read back at once."""
     from physics.cameras.gl.atlas import Atlas
-    from physics.world.world import BulletWorld
+    from scenarios.execution.wiring import world_of
 
     street_map = place_of(size_m)
+    world = world_of(street_map, 5)
     busy = busy_street(street_map, PERSONS, frames)
-    world = BulletWorld(street_map, 5, (), "courier")
     spec = CameraSpec(*SIZE, fov_deg=60.0)
     with Atlas([world] * environments, spec) as eyes:
 

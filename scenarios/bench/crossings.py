@@ -27,7 +27,7 @@ from cosim.spec.scenario import City, Scenario
 from scenarios.bench.crowd_tally import Tally
 from scenarios.builders.crossings import build_all
 from scenarios.execution.places import place
-from scenarios.execution.run import Outcome, episode
+from scenarios.execution.run import Outcome, run_episode
 from scenarios.execution.shepherd import end_with
 from sumo_nets.crowd.stoplines import StopLines
 
@@ -117,7 +117,7 @@ def cross(scenario: Scenario, policy: str) -> Crossed:
         tally.see(step.street_after)
         tally.drove(lines.passed(step.street_after.vehicles.ids))
 
-    outcome = episode(scenario, driver_of(policy), watch=watch)
+    outcome = run_episode(scenario, driver_of(policy), watches=[watch])
     if outcome.traceback:
         driver_of.cache_clear()
     return told(scenario, outcome, tally)

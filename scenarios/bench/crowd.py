@@ -11,35 +11,32 @@ import multiprocessing
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any
+from dataclasses import replace
+from typing import Any, cast
 
 import msgspec
 import shapely
-from shapely.geometry import LineString
+from shapely.geometry import LineString, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import Command, Motion, RobotState, Street, frozen
-from cosim.episode.driver import Driver
-from cosim.episode.loop import Parts, steps
-from cosim.judge.referee import Referee
-from cosim.place.street_map import Port, StreetMap, WalkableArea
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.route import Route
-from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec, Scenario
-from physics.robots import robot as robot_model
 from physics.street.furniture import footprints
 from physics.world.ground import Ground
 from physics.world.tiles import key_at
 from scenarios.bench.crowd_tally import Tally
 from scenarios.bench.group_tally import widest_gaps
-from scenarios.builders.barriers import fenced
 from scenarios.builders.long_horizon import build
-from scenarios.events import react
-from scenarios.execution.assemble import clear_of
+from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
-from scenarios.residents.director import among_residents
+from scenarios.execution.wiring import Stage
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.stoplines import StopLines
 
@@ -90,13 +87,6 @@ class Glider:
         return Motion(self._robot, frozen([pose] * substeps))
 
 
-class Directly:
-    """The director, asked without a session in between."""
-
-    def react(self, query: EventQuery) -> EventReply:
-        return react(query)
-
-
 def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
     """Watch the crowd of a city for so many simulated minutes."""
     _, street_map = place(city)
@@ -131,49 +121,45 @@ def drive(
 
     gaps_m: takes up the gaps within groups.
     """
-    net_path, _ = place(scenario.place)
+    clock, policy = Clock.for_rate(Route.manifest.rate_hz), Route()
+    tally, lines = Tally(street_map, clock.tick_s, things_along(scenario, street_map)), StopLines(clock.tick_s)
+    crowd: SumoCrowd
+    timed: Stopwatch
+    persons = 0
+
+    def gliding(stage: Stage) -> None:
+        nonlocal crowd, timed
+        crowd = cast(SumoCrowd, stage.parts.crowd)
+        timed = Stopwatch(crowd)
+        stage.parts = replace(stage.parts, world=Glider(stage.parts.world.footprint_m), crowd=timed)
+
+    def watch(step: Step, _: Verdict) -> None:
+        nonlocal persons
+        street = step.street_after
+        persons += sum(name.startswith("c") for name in street.people.ids)
+        tally.see(street)
+        tally.drove(lines.passed(street.vehicles.ids))
+        if (step.tick + 1) % GROUPS_EVERY_TICKS == 0:
+            gaps_m.extend(widest_gaps(crowd.groups, street.people))
+
+    with Episode(scenario, policy.manifest, watches=[watch], through=gliding) as episode:
+        policy.reset(scenario.id, scenario.seed)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < limit_ticks:
+            observation = episode.advance(policy.act(observation), until_tick=limit_ticks)
+        return tally, episode.moment.tick, persons, timed.spent_s
+
+
+def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, Polygon]]:
+    """What stands around a route: kinds and outlines of props and buildings."""
     around = shapely.buffer(LineString(scenario.route), THINGS_M)
-    walkable = street_map.walkable_near(around)
     ground = Ground(street_map, scenario.place.seed)
     props = ground.standing(around)
     things = [(prop.kind, polygon) for prop, polygon in zip(props, footprints(props), strict=True)]
     x0, y0, x1, y1 = around.bounds
     (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
     keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
-    things += [("building", building.polygon) for key in keys for building in ground.buildings(key)]
-    model = robot_model(scenario.robot)
-    footprint_m = (model.length_m, model.width_m)
-    free = shapely.buffer(clear_of(fenced(walkable, scenario.barriers), props), -footprint_m[1] / 2)
-    shapely.prepare(free)
-    clock = Clock.for_rate(Route.manifest.rate_hz)
-    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-    tally, referee = (
-        Tally(street_map, clock.tick_s, things),
-        Referee(scenario, WalkableArea(walkable), footprint_m, clock),
-    )
-    crowd = SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2], footprint_m)
-    ticks = persons = 0
-    with crowd:
-        timed = Stopwatch(crowd)
-        director = among_residents(Directly(), scenario, street_map, ground, lambda: crowd.street.people)
-        parts = Parts(Glider(footprint_m), timed, director, Driver(Route()), None, free)
-        lines = StopLines(clock.tick_s)
-        run = steps(scenario, clock, parts)
-        step = next(run)
-        while True:
-            ticks += 1
-            street = step.street_after
-            persons += sum(name.startswith("c") for name in street.people.ids)
-            tally.see(street)
-            tally.drove(lines.passed(street.vehicles.ids))
-            if ticks % GROUPS_EVERY_TICKS == 0:
-                gaps_m += widest_gaps(crowd.groups, street.people)
-            verdict = referee.judge(step)
-            if verdict.ended is not None or ticks >= limit_ticks:
-                break
-            step = run.send(verdict.reset)
-        run.close()
-    return tally, ticks, persons, timed.spent_s
+    return things + [("building", building.polygon) for key in keys for building in ground.buildings(key)]
 
 
 class Stopwatch:

@@ -24,10 +24,10 @@ from cosim.core.state import RobotState
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
-from cosim.spec.scenario import CrowdSpec, Place
+from cosim.spec.scenario import Place, Scenario
 from scenarios.execution.places import place
 from scenarios.execution.shepherd import end_with
-from sumo_nets.crowd.crowd import SumoCrowd
+from scenarios.execution.wiring import crowd_of
 
 BODIES = 3
 """The robot and two event pedestrians."""
@@ -97,11 +97,16 @@ def _child(pipe: Connection, where: Place, seed: int, ticks: int, parent: int) -
 
 def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
     """Simulate a place in this process, with a word every REPORT_TICKS and at the end."""
-    net_path, street_map = place(where)
+    _, street_map = place(where)
     graph = WalkGraph(street_map)
     bodies = [wandering(street_map, graph, rng) for rng in np.random.default_rng([seed, 0xE2D]).spawn(BODIES)]
     persons = vehicles = 0
-    with SumoCrowd(net_path, street_map, CrowdSpec(), seed, frozenset(), next(bodies[0])[:2]) as crowd:
+    start = next(bodies[0])
+    ahead = (start.x_m + 10.0, start.y_m)
+    scenario = Scenario(
+        id="soak", suite="soak", place=where, seed=seed, start=start, goal=ahead, route=((start.x_m, start.y_m), ahead)
+    )
+    with crowd_of(scenario) as crowd:
         for tick in range(ticks):
             robot, *others = map(next, bodies)
             actors = tuple(

@@ -18,16 +18,18 @@ from collections.abc import Callable, Sequence
 from itertools import pairwise
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgspec
 
 from cosim.core.errors import EngineError
-from cosim.episode.driver import Driver
 from cosim.episode.ports import Camera, CameraSpec, Crowd, Director, Manifest, World
-from cosim.episode.step import Reset, Step
 from cosim.policies.route import Route
 from cosim.spec.scenario import City, CrowdSpec, Scenario
+
+if TYPE_CHECKING:
+    from scenarios.execution.scorer import Scorer
+    from scenarios.execution.wiring import Stage
 
 MEASURED_S = 60.0
 WARM_UP_S = 5.0
@@ -96,42 +98,38 @@ def drive(size_m: float) -> Drive:
     """Drive for MEASURED_S simulated seconds in a city of a size."""
     import physics.world.profiling
     import sumo_nets.crowd.profiling
-    from cosim.episode.loop import Parts, steps
-    from cosim.judge.referee import Referee
-    from cosim.records.record import Recorder
-    from scenarios.execution.assemble import staged
+    from cosim.episode.loop import Parts
+    from scenarios.execution.episode import Episode
 
     scenario, spent, engine = scenario_in(size_m), Spent(float), Spent(float)
     physics.world.profiling.put_stopwatch(engine.timed)
     sumo_nets.crowd.profiling.put_stopwatch(engine.timed)
-    with staged(scenario, FourHertz()) as stage:
-        parts, clock = stage.parts, stage.clock
-        timed = Parts(
+    policy = FourHertz()
+
+    def timed(stage: Stage) -> None:
+        parts = stage.parts
+        stage.parts = Parts(
             cast(World, Timed(parts.world, "step", "physics", spent)),
             cast(Crowd, Timed(parts.crowd, "step", "crowd", spent)),
             cast(Director, Timed(parts.director, "react", "bridge", spent)),
-            cast(Driver, Timed(parts.driver, "act", "policy", spent)),
             cast(Camera, Timed(parts.camera, "render", "camera", spent)),
-            parts.free,
         )
-        referee, recorder = Referee(scenario, stage.area, parts.world.footprint_m, clock), Recorder(clock.tick_s)
+        stage.scorer = cast("Scorer", Timed(stage.scorer, "score", "referee", spent))
 
-        def score(step: Step) -> Reset | None:
-            verdict = referee.judge(step)
-            recorder.add(step, verdict)
-            return verdict.reset
-
-        scored = spent.timed("referee", score)
-        run = steps(scenario, clock, timed)
-        step, began = next(run), 0.0
-        warm, last = clock.ticks(WARM_UP_S), clock.ticks(WARM_UP_S + MEASURED_S)
-        for tick in range(last):
-            if tick == warm:
-                spent.clear()
-                engine.clear()
-                began = time.perf_counter()
-            step = run.send(scored(step))
+    with Episode(scenario, policy.manifest, through=timed) as episode:
+        act = spent.timed("policy", policy.act)
+        policy.reset(scenario.id, scenario.seed)
+        observation = episode.reset()
+        warm, last = episode.clock.ticks(WARM_UP_S), episode.clock.ticks(WARM_UP_S + MEASURED_S)
+        while episode.moment.tick < warm:
+            observation = episode.advance(act(observation))
+        spent.clear()
+        engine.clear()
+        began = time.perf_counter()
+        while episode.moment.tick < last:
+            observation = episode.advance(act(observation))
         whole = time.perf_counter() - began
+        people = len(episode.moment.street.people)
     spent["loop"] = whole - sum(spent.values())
     scale = 1000.0 / MEASURED_S
     return Drive(
@@ -139,7 +137,7 @@ def drive(size_m: float) -> Drive:
         engine_ms={part: seconds * scale for part, seconds in engine.items()},
         factor=MEASURED_S / whole,
         memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        people=len(step.street.people),
+        people=people,
         round_trip_ms=1000.0 * spent["bridge"] / (last - warm),
     )
 
@@ -147,12 +145,10 @@ def drive(size_m: float) -> Drive:
 def first_frame(size_m: float) -> float:
     """Seconds from a new process to the first camera frame of a cached city, imports included."""
     began = time.perf_counter()
-    from scenarios.execution.assemble import staged
+    from scenarios.execution.episode import Episode
 
-    scenario = scenario_in(size_m)
-    with staged(scenario, FourHertz()) as stage:
-        assert stage.parts.camera is not None
-        stage.parts.camera.render(stage.parts.world.place(scenario.start_pose), stage.parts.crowd.street)
+    with Episode(scenario_in(size_m), FourHertz.manifest) as episode:
+        episode.reset()
         return time.perf_counter() - began
 
 

@@ -7,10 +7,11 @@ import time
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
+import msgspec
+
 from cosim.core.clock import Clock
-from cosim.core.geometry import Polyline, Pose
+from cosim.core.geometry import Pose
 from cosim.core.state import RobotState
-from cosim.place.street_map import Port
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
 from scenarios.bench.speed import Spent, alone, scenario_in
@@ -48,17 +49,14 @@ def measure(rounds: int, tell: Callable[[str], None]) -> dict[int, list[StreetSt
 def street_step(persons: int) -> StreetStep:
     """Walk a robot down a long-horizon route among so many persons for a simulated minute."""
     import sumo_nets.crowd.profiling
-    from scenarios.execution.places import place
-    from sumo_nets.crowd.crowd import SumoCrowd
+    from scenarios.execution.wiring import crowd_of
 
-    scenario, inside = scenario_in(2000.0), Spent(float)
-    spec = CrowdSpec(persons=persons, vehicles=VEHICLES)
-    net_path, street_map = place(scenario.place)
-    line = Polyline(scenario.route)
-    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
+    inside = Spent(float)
+    scenario = msgspec.structs.replace(scenario_in(2000.0), crowd=CrowdSpec(persons=persons, vehicles=VEHICLES))
+    line = scenario.route_line
     sumo_nets.crowd.profiling.put_stopwatch(inside.timed)
     spent_s = shown = 0.0
-    with SumoCrowd(net_path, street_map, spec, scenario.seed, closed, scenario.start[:2]) as crowd:
+    with crowd_of(scenario) as crowd:
         for tick in range(WARM_UP_TICKS + MEASURED_TICKS):
             if tick == WARM_UP_TICKS:
                 inside.clear()

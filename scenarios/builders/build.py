@@ -23,7 +23,7 @@ from cosim.spec.events import GROUPS
 from cosim.spec.scenario import City, Scenario, Suite, content_hash, write_suite
 from scenarios.builders import long_horizon, reactive
 from scenarios.execution.places import place
-from scenarios.execution.run import episode
+from scenarios.execution.run import run_episode
 from sumo_nets.city.seeds import shipped_cities
 
 CITY_SEEDS = (11, 23, 37, 41)
@@ -104,7 +104,7 @@ def proved(candidates: Candidates, expert: str) -> tuple[Scenario, Proof, list[s
     dropped: list[str] = []
     for attempt in range(TRIES_PER_SCENARIO):
         scenario = candidates.draw(1000 * attempt + candidates.number)
-        record = episode(scenario, load_policy(expert)).record
+        record = run_episode(scenario, load_policy(expert)).record
         if record.status == "done" and record.measures["success"] == 1.0:
             return scenario, proof_of(scenario, record, expert), dropped
         told = [f"{f.kind} {f.other_kind} at {f.route_s_m:.0f} m" for f in record.failures]

@@ -16,9 +16,8 @@ from cosim.judge.delay import Delay, Tracks, delay_of
 from cosim.judge.referee import Verdict
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import Scenario
-from scenarios.execution.places import place
+from scenarios.execution.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.demand_replay import StreetAgain
 
 TELL_EVERY_TICKS: Final = 20
 Tell = Callable[[float], None]
@@ -60,9 +59,8 @@ class Beside:
 
     def compared(self, scenario: Scenario, entrances: Entrances, tell: Tell = untold) -> Compared:
         """entrances: of the episode. No SUMO may be running in this process."""
-        net_path, street_map = place(scenario.place)
         absent = Tracks("c"), Tracks("v")
-        with StreetAgain(net_path, street_map, scenario, entrances) as crowd:
+        with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
                 if tick % TELL_EVERY_TICKS == 0:
                     tell(tick / len(self._moments))

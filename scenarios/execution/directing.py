@@ -14,7 +14,7 @@ import importlib.util
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
@@ -22,14 +22,12 @@ from typing import Final
 
 import scenarios.events
 from bridge import keys
-from bridge.director import Outside, RemoteDirector, Waiting, serve_director
+from bridge.director import RemoteDirector, Waiting, serve_director
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError
 from cosim.episode.ports import Director
+from cosim.spec.options import Outside
 from scenarios.events import react
-
-Direct = Callable[[str], AbstractContextManager[Director]]
-"""Gives the director of an episode, by the episode's name."""
 
 RETRY_S: Final = 0.2
 LEFT_S: Final = 60.0
@@ -37,6 +35,11 @@ LEFT_S: Final = 60.0
 _FOLDER: Final = "cosim-zenoh-"
 _SOCKET: Final = "hub.sock"
 _OURS: Final = ("cosim.", "scenarios.")
+
+
+def director_of(episode: str, outside: Outside | None, waiting: Waiting) -> AbstractContextManager[Director]:
+    """The director of an episode's event pedestrians: the one outside, or one of its own."""
+    return directed(episode) if outside is None else directed_by(outside, waiting, episode)
 
 
 @contextmanager
@@ -99,7 +102,9 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
             imported = [node.module, *(f"{node.module}.{alias.name}" for alias in node.names)]
         for other in imported:
             if other.startswith(_OURS):
-                _gather(other, found)
+                rooms = other.split(".")
+                for depth in range(2, len(rooms) + 1):  # the rooms that it lies in are loaded before it
+                    _gather(".".join(rooms[:depth]), found)
 
 
 def _sweep(temporary: Path) -> None:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import msgspec
 
-from bridge.director import Outside
 from cosim.episode.ports import Manifest
 from cosim.records.record import Status
-from cosim.spec.injection import Live
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 
 
@@ -22,20 +19,11 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this. folder: where record.json and trajectory.npz go. frames_every_s: 0 keeps no camera frames.
-
-    camera: what draws the pictures, the same for a whole run. outside: the director, when the episode has none of its
-    own. counterfactual: see `scenarios.execution.run.episode`.
-    """
+    """Run this. folder: where record.json and trajectory.npz go."""
 
     scenario: Scenario
-    suite_hash: str
     folder: str
-    frames_every_s: float = 0.0
-    camera: Literal["gl", "bullet", "bullet-egl"] = "bullet"
-    live: Live | None = None
-    outside: Outside | None = None
-    counterfactual: bool = False
+    options: EpisodeOptions = EpisodeOptions()
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):

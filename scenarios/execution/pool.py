@@ -14,14 +14,12 @@ from multiprocessing.connection import wait
 
 import msgspec
 
-from bridge.director import Outside
 from cosim.core.errors import MachineError, UsageError, unwritable
 from cosim.episode.driver import Driver
 from cosim.records.record import begun
 from cosim.records.run_folder import RunFolder
-from cosim.spec.injection import Live
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from physics.cameras.choice import CameraName
 from scenarios.execution.asked import Patience, Question
 from scenarios.execution.messages import Done, Hello, Job, Message, Ready, Unable, Unsaved
 from scenarios.execution.process import Process
@@ -44,22 +42,16 @@ def run_all(
     *,
     jobs: int,
     tell: Tell,
-    frames_every_s: float = 0.0,
-    camera: CameraName = "bullet",
-    live: Live | None = None,
-    outside: Outside | None = None,
+    options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     patience: Patience = Patience(),  # noqa: B008  a frozen value
 ) -> None:
     """Run scenarios, `jobs` at a time, adding each record to the folder as it ends.
 
-    driver: the policy as it was loaded here; every process loads its own. outside: the director of the event
-    pedestrians, when the episodes have none of their own. Raises UsageError when a process cannot load the policy,
-    MachineError when none can be started.
-    """
+    driver: the policy as it was loaded here; every process loads its own. Raises UsageError when a process cannot load
+    the policy, MachineError when none can be started."""
 
     def job(scenario: Scenario) -> Job:
-        target, spec = str(folder.episode_folder(scenario.id)), folder.spec
-        return Job(scenario, spec.suite_hash, target, frames_every_s, camera, live, outside, spec.counterfactual)
+        return Job(scenario, str(folder.episode_folder(scenario.id)), options)
 
     pool = _Pool(folder, Hello(policy, driver.manifest, driver.source_hash), job, tell, patience)
     waiting = deque(scenarios)

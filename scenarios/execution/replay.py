@@ -12,15 +12,17 @@ from cosim.core.clock import Clock
 from cosim.core.errors import RunError, unknown
 from cosim.core.telling import Tell, untold
 from cosim.core.versions import versions
+from cosim.episode.log import Log
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.policies.replay import Replay
-from cosim.records.record import Log, Record, begun, row_of
+from cosim.records.record import Record, row_of
 from cosim.records.run_folder import read_records
+from cosim.spec.options import CameraChoice, EpisodeOptions
 from cosim.spec.scenario import Scenario, read_suite
-from scenarios.execution.assemble import staged
 from scenarios.execution.counterfactual import Beside, Compared
-from scenarios.execution.run import Watch, drive
+from scenarios.execution.episode import Episode, Watch
+from scenarios.execution.run import drive
 from sumo_nets.crowd.demand_log import Entrances
 
 OF_THE_ROAD: Final = 12
@@ -48,6 +50,13 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
     return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
 
 
+def replaying(told: Recorded, camera: CameraChoice = "auto", *watches: Watch) -> tuple[Episode, Replay]:
+    """The recorded episode once more, not begun yet, and the policy that does what was done in it."""
+    options = EpisodeOptions(suite_hash=told.record.suite_hash, camera=camera, injections=told.record.injections)
+    policy = Replay(told.log.command)
+    return Episode(told.scenario, policy.manifest, options, watches=watches), policy
+
+
 def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:
     """Run it again; the state hash that comes out."""
     return _again(told, tell, *watches)[0]
@@ -61,17 +70,14 @@ def compared(told: Recorded, tell: Tell = untold) -> tuple[str, Compared]:
 
 
 def _again(told: Recorded, tell: Tell, *watches: Watch) -> tuple[str, Entrances]:
-    driver = Replay(told.log.command)
-
     def watch(step: Step, _: Verdict) -> None:
         tell(f"replaying {told.scenario.id}", step.tick / len(told.log))
 
     tell("starting SUMO and PyBullet")
-    with staged(told.scenario, driver, script=told.record.injections) as stage:
-        record, _ = drive(
-            begun(told.scenario, driver.manifest, told.record.suite_hash), told.scenario, stage, watch, *watches
-        )
-    return record.state_hash, stage.entrances
+    episode, policy = replaying(told, "auto", watch, *watches)
+    with episode:
+        drive(episode, policy)
+        return episode.result()[0].state_hash, episode.entrances
 
 
 class Alike:

@@ -39,8 +39,8 @@ from scenarios.execution.messages import (
 )
 
 if TYPE_CHECKING:
-    from scenarios.execution.directing import Direct
-    from scenarios.execution.run import Outcome, Watch
+    from scenarios.execution.episode import Watch
+    from scenarios.execution.run import Outcome
 
 REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"
@@ -51,7 +51,7 @@ def main(pipe_descriptor: int, asked_descriptor: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe, home = Connection(pipe_descriptor), Path.cwd()
     hello = decode_hello(pipe.recv_bytes())
-    episode = engines(pipe)
+    run_episode = engines(pipe)
     timer = Asked(asked_descriptor)
     driver: Driver | None = loaded(hello, timer, pipe)
     send(pipe, Ready())
@@ -62,15 +62,12 @@ def main(pipe_descriptor: int, asked_descriptor: int) -> None:
             return
         os.chdir(home)  # the policy may have gone elsewhere
         driver = driver or loaded(hello, timer, pipe)
-        outcome = episode(
+        outcome = run_episode(
             job.scenario,
             driver,
-            suite_hash=job.suite_hash,
-            camera=job.camera,
-            watch=watcher(job, pipe),
-            live=job.live,
-            direct=director_of(job, pipe),
-            counterfactual=job.counterfactual,
+            job.options,
+            watches=[watcher(job, pipe)],
+            waiting=partial(waits, job, pipe),
             comparing=partial(comparing, job, pipe),
         )
         if outcome.traceback:
@@ -80,13 +77,13 @@ def main(pipe_descriptor: int, asked_descriptor: int) -> None:
 
 
 def engines(pipe: Connection) -> Callable[..., Outcome]:
-    """`scenarios.execution.run.episode`. An engine that cannot be imported is told, and ends the process."""
+    """`scenarios.execution.run.run_episode`. An engine that cannot be imported is told, and ends the process."""
     try:
-        from scenarios.execution.run import episode  # the engines greet on stdout when they are imported
+        from scenarios.execution.run import run_episode  # the engines greet on stdout when they are imported
     except (ImportError, OSError) as error:
         send(pipe, Unable(f"{CANNOT_START} {said_by(error)}. `cosim doctor` says more", blames_policy=False))
         raise
-    return episode
+    return run_episode
 
 
 def loaded(hello: Hello, timer: Asked, pipe: Connection) -> Driver:
@@ -108,25 +105,20 @@ def loaded(hello: Hello, timer: Asked, pipe: Connection) -> Driver:
 
 def leave(job: Job, outcome: Outcome, pipe: Connection) -> None:
     """Write what came out of an episode, and report it."""
+    from scenarios.execution.run import keep
+
     folder = Path(job.folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if outcome.log is not None:
-            outcome.log.save(folder / "trajectory.npz")
-        outcome.record.save(folder / "record.json")
+        keep(outcome, folder)
     except OSError as error:
         send(pipe, Unsaved(job.scenario.id, f"{folder}: {error.strerror}"))
     else:
         send(pipe, Done(job.scenario.id, outcome.record.status))
 
 
-def director_of(job: Job, pipe: Connection) -> Direct:
-    """The episode's own director, or the one outside that the job names; waits for that one are reported."""
-    from scenarios.execution.directing import directed, directed_by
-
-    if job.outside is None:
-        return directed
-    return partial(directed_by, job.outside, lambda reason: send(pipe, Waits(job.scenario.id, reason)))
+def waits(job: Job, pipe: Connection, reason: str) -> None:
+    """Reports what the episode waits for."""
+    send(pipe, Waits(job.scenario.id, reason))
 
 
 def comparing(job: Job, pipe: Connection, share: float) -> None:
@@ -141,7 +133,7 @@ def watcher(job: Job, pipe: Connection) -> Watch:
     failures = 0
     next_frame_s = 0.0
     frames = Path(job.folder) / "frames"
-    if job.frames_every_s:
+    if job.options.frames_every_s:
         shutil.rmtree(frames, ignore_errors=True)
         frames.mkdir(parents=True)
 
@@ -149,8 +141,8 @@ def watcher(job: Job, pipe: Connection) -> Watch:
         nonlocal failures, next_frame_s
         failures += verdict.failure is not None
         time_s = Clock().time_s(step.tick)
-        if step.frame is not None and job.frames_every_s and time_s >= next_frame_s:
-            next_frame_s += job.frames_every_s
+        if step.frame is not None and job.options.frames_every_s and time_s >= next_frame_s:
+            next_frame_s += job.options.frames_every_s
             cv2.imwrite(str(frames / f"{step.tick:06d}.png"), step.frame.rgb[..., ::-1])
         if step.tick % REPORT_EVERY_TICKS == 0:
             send(pipe, Progress(job.scenario.id, time_s, step.route_s_after_m, failures))

@@ -15,7 +15,8 @@ import numpy as np
 import pandas as pd
 
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.records.record import Log, Record
+from cosim.episode.log import Log
+from cosim.records.record import Record
 from cosim.records.run_folder import read_records
 from cosim.spec.events import Event, Kind
 from cosim.spec.scenario import Scenario, read_suite

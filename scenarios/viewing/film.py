@@ -8,7 +8,7 @@ state hash to show, but every tick of it is as recorded.
 from __future__ import annotations
 
 import math
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -22,18 +22,15 @@ from cosim.core.telling import Tell, untold
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
-from cosim.policies.replay import Replay
-from cosim.records.record import Record, begun
+from cosim.records.record import Record
 from cosim.report import hud
 from cosim.report.legend import Image
 from cosim.report.minimap import Minimap
 from cosim.report.video import Video
+from cosim.spec.options import CameraChoice
 from cosim.spec.scenario import Scenario
-from physics.cameras.choice import CameraChoice
-from scenarios.execution.assemble import staged
 from scenarios.execution.places import place
-from scenarios.execution.replay import Alike, check, recorded
-from scenarios.execution.run import drive
+from scenarios.execution.replay import Alike, check, recorded, replaying
 from scenarios.viewing.look import View, behind, over
 
 EASE_S: Final = 0.5
@@ -63,10 +60,6 @@ class Cut(NamedTuple):
     view: View = "follow"
 
 
-class _Enough(Exception):
-    """The last picture is drawn."""
-
-
 def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
     """Write the film of a finished episode; the simulated second at which it ends, infinite for the episode's end.
 
@@ -87,22 +80,20 @@ def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = un
     tell("reading the street map, starting SUMO, PyBullet and the camera")
     _, street_map = place(scenario.place)
     fps = round(1.0 / Clock().tick_s)
-    driver = Replay(log.command)
     with ExitStack() as stack:
         video = stack.enter_context(Video(output, cut.size, fps))
-        stage = stack.enter_context(staged(scenario, driver, cut.camera, script=record.injections))
-        camera = stack.enter_context(stage.eyes(robot_eye(cut)))
-        minimap = Minimap(street_map, scenario, stage.parts.world.footprint_m)
+        episode, policy = replaying(told, cut.camera)
+        stack.enter_context(episode)
+        camera = stack.enter_context(episode.eyes(robot_eye(cut)))
+        minimap = Minimap(street_map, scenario, episode.footprint_m)
         reel = _Reel(scenario, record, minimap, camera, video, cut, last, tell)
-
-        def until_the_last(step: Step, _: Verdict) -> None:
-            if step.tick + 1 == last < len(log):
-                raise _Enough
-
-        watches = (Alike(folder, told).watch, reel.take, until_the_last)
-        with suppress(_Enough):
-            again, _ = drive(begun(scenario, driver.manifest, record.suite_hash), scenario, stage, *watches)
-            check(folder, told, again.state_hash)
+        for watch in (Alike(folder, told).watch, reel.take):
+            episode.watch(watch)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < last:
+            observation = episode.advance(policy.act(observation))
+        if episode.over:
+            check(folder, told, episode.result()[0].state_hash)
     return math.inf if last == len(log) else Clock().time_s(last)
 
 

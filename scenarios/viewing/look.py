@@ -10,19 +10,15 @@ from numpy.typing import ArrayLike
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
-from cosim.core.state import RobotState, Street
+from cosim.core.state import RobotState
 from cosim.core.telling import Tell, untold
 from cosim.episode.ports import CameraSpec
-from cosim.episode.step import Step
-from cosim.judge.referee import Verdict
 from cosim.policies.load import load_policy
-from cosim.records.record import begun
 from cosim.report.legend import Image
+from cosim.spec.options import CameraChoice, EpisodeOptions
 from cosim.spec.scenario import Scenario
-from physics.cameras.choice import CameraChoice
-from scenarios.execution.assemble import staged
+from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
-from scenarios.execution.run import drive
 
 View = Literal["robot", "follow", "above"]
 VIEWS: Final[tuple[View, ...]] = ("robot", "follow", "above")
@@ -32,14 +28,6 @@ AHEAD_M: Final = 3.0
 HIGH_M: Final = 24.0
 OVER_SLANT: Final = 0.22
 """From above the eye is behind what it looks at by this share of its height: little, or a house may stand between."""
-
-
-class _Reached(Exception):
-    """The moment that was asked for."""
-
-    def __init__(self, robot: RobotState, street: Street) -> None:
-        super().__init__()
-        self.robot, self.street = robot, street
 
 
 def look(
@@ -61,26 +49,21 @@ def look(
     tell(f"reading the street map of {scenario.place.name}")
     place(scenario.place)
     tell("starting SUMO, PyBullet and the camera")
-    with staged(scenario, driver, camera_name) as stage, stage.eyes(spec) as camera:
-        seen: list[Step] = []
-
-        def watch(step: Step, _: Verdict) -> None:
-            seen[:] = [step]
-            if step.tick < last:
-                tell(f"simulating to {at_s:g} s", step.tick / last)
-            else:
-                raise _Reached(step.robot, step.street)
-
-        try:
-            drive(begun(scenario, driver.manifest, ""), scenario, stage, watch)
-            robot, street = seen[0].motion.robot, seen[0].street_after
-        except _Reached as moment:
-            robot, street = moment.robot, moment.street
+    with (
+        Episode(scenario, driver.manifest, EpisodeOptions(camera=camera_name)) as episode,
+        episode.eyes(spec) as camera,
+    ):
+        driver.reset(scenario.id, scenario.seed)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < last:
+            tell(f"simulating to {at_s:g} s", episode.moment.tick / last)
+            observation = episode.advance(driver.act(observation), until_tick=last)
+        robot, street = episode.moment.robot, episode.moment.street
         tell("drawing")
         if view == "robot":
-            return camera.render(robot, street).rgb, Clock().time_s(street.tick)
+            return camera.render(robot, street).rgb, episode.time_s
         eye, target = behind(robot) if view == "follow" else over(robot)
-        return camera.picture(eye, target, street, robot, size).rgb, Clock().time_s(street.tick)
+        return camera.picture(eye, target, street, robot, size).rgb, episode.time_s
 
 
 def behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:

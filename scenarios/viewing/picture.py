@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 
 from cosim.core.errors import MachineError, RunError
-from cosim.records.record import Log, Record
+from cosim.episode.log import Log
+from cosim.records.record import Record
 from cosim.report.above import draw_above
 from cosim.spec.scenario import read_suite
 from scenarios.execution.places import place

@@ -1,9 +1,8 @@
 """A whole city from a seed: a jittered lattice with streets removed, bent, joined by roundabouts and crosswalks.
 
-The plan is pure geometry and topology; `sumo_nets.city.store` makes a street net of it. A street class and its widths run
-along a whole row or column of the lattice. Metres, x east, y north; the city fills the square from 0, 0 to size_m,
-size_m.
-"""
+The plan is pure geometry and topology; `sumo_nets.city.store` makes a street net of it. A street class and its widths
+run along a whole row or column of the lattice. Metres, x east, y north; the city fills the square from 0, 0 to size_m,
+size_m."""
 
 from __future__ import annotations
 

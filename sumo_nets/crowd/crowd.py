@@ -29,7 +29,8 @@ from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
-from sumo_nets.crowd.demand_log import Entrances, Kept
+from sumo_nets.crowd.demand_log import DRIVERS, PEDESTRIANS, Entrances, Kept
+from sumo_nets.crowd.demand_replay import replayed_demand
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.lights import Signals
 from sumo_nets.crowd.pose_filter import STANDING_MPS, PoseFilter
@@ -48,7 +49,6 @@ WARM_UP_S = 8.0
 SIGNAL_CLOCK_S = 3600
 """The signals' clocks start somewhere in this span, drawn from the seed."""
 
-PEDESTRIANS, DRIVERS = "pedestrians", "drivers"
 NOWHERE_M = -1e8
 """Who has not set out yet is beyond this."""
 
@@ -64,7 +64,7 @@ class SumoCrowd(Crowd):
     """The crowd around the robot on the street net at `net_path`, of which `street_map` was read.
 
     closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
-    footprint_m: its length and width.
+    footprint_m: its length and width. before: who entered and left a street like this one, to be let in and out again.
     Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
     entrances: who has come and gone since it was entered.
     """
@@ -81,10 +81,12 @@ class SumoCrowd(Crowd):
         closed: frozenset[Port],
         start_xy: tuple[float, float],
         footprint_m: tuple[float, float] = (0.7, 0.55),
+        before: Entrances | None = None,
     ) -> None:
         self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
         self._closed, self._start_xy = closed, start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
+        self._before = before
         self._street: Street | None = None
 
     def __enter__(self) -> Self:
@@ -191,6 +193,8 @@ class SumoCrowd(Crowd):
     ) -> tuple[Pedestrians, Drivers]:
         """Those who let people and vehicles in and out; what they do is kept in `entrances`."""
         self.entrances = Entrances()
+        if self._before is not None:
+            return replayed_demand(self._before, self._map, self._spec, self._closed, self._together)
         on_foot, driving = (Kept(libsumo, self.entrances, whose) for whose in (PEDESTRIANS, DRIVERS))
         people = Pedestrians(on_foot, self._map, self._spec, rng_persons, self._closed, self._together)
         return people, Drivers(driving, self._map, self._spec, rng_vehicles)

@@ -15,6 +15,8 @@ READS: Final = ("get", "subscribe")
 """Calls of SUMO that begin so change nothing."""
 KEPT: Final = ("person", "vehicle", "route")
 ADDS: Final = "add"
+PEDESTRIANS: Final = "pedestrians"
+DRIVERS: Final = "drivers"
 
 
 class Call(NamedTuple):

@@ -4,39 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from itertools import groupby
-from pathlib import Path
 from typing import Any
 
 import libsumo
 import numpy as np
 
 from cosim.place.street_map import Port, StreetMap
-from cosim.spec.scenario import Scenario
-from sumo_nets.crowd.crowd import DRIVERS, PEDESTRIANS, SumoCrowd
+from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand import VEHICLE_TYPES, Drivers, Pedestrians
-from sumo_nets.crowd.demand_log import ADDS, Entrances, again
+from sumo_nets.crowd.demand_log import ADDS, DRIVERS, PEDESTRIANS, Entrances, again
+from sumo_nets.crowd.group_cohesion import Together
 
 
-class StreetAgain(SumoCrowd):
-    """The street of a scenario with the `before` entrances in place of drawn ones."""
-
-    def __init__(self, net_path: Path, street_map: StreetMap, scenario: Scenario, before: Entrances) -> None:
-        closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-        super().__init__(net_path, street_map, scenario.crowd, scenario.seed, closed, scenario.start[:2])
-        self._before = before
-
-    def _demand(
-        self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
-    ) -> tuple[Pedestrians, Drivers]:
-        people = PedestriansAgain(libsumo, self._map, self._spec, rng_persons, self._closed, self._together)
-        drivers = DriversAgain(libsumo, self._map, self._spec, rng_vehicles)
-        people.before = drivers.before = self._before
-        drivers.sizes = {
-            str(call.arguments[0]): VEHICLE_TYPES[call.options["typeID"]][:2]
-            for call in self._before.of(DRIVERS, ADDS)
-            if call.domain == "vehicle"
-        }
-        return people, drivers
+def replayed_demand(
+    before: Entrances, street_map: StreetMap, spec: CrowdSpec, closed: frozenset[Port], together: Together
+) -> tuple[PedestriansAgain, DriversAgain]:
+    """Those who let the same people and vehicles in and out at the same moments. They draw nothing."""
+    nothing = np.random.default_rng(0)
+    people = PedestriansAgain(libsumo, street_map, spec, nothing, closed, together)
+    drivers = DriversAgain(libsumo, street_map, spec, nothing)
+    people.before = drivers.before = before
+    drivers.sizes = {
+        str(call.arguments[0]): VEHICLE_TYPES[call.options["typeID"]][:2]
+        for call in before.of(DRIVERS, ADDS)
+        if call.domain == "vehicle"
+    }
+    return people, drivers
 
 
 class PedestriansAgain(Pedestrians):

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
 
 import cosim
+import sumo_nets
 from cosim.place.street_map import StreetMap
 from sumo_nets.city.store import cache_folder
 from sumo_nets.net.netfile import read_net
@@ -143,8 +144,8 @@ def _key(name: str, net: bytes) -> str:
 @cache
 def _reader() -> bytes:
     """What makes a StreetMap of a net: the source of this package and of the words it uses, and the libraries."""
-    here, words = Path(__file__).parent, Path(cosim.__file__).parent
-    sources = [*sorted(here.glob("*.py")), *sorted(words.glob("*.py"))]
+    rooms = [Path(sumo_nets.__file__).parent, *(Path(cosim.__file__).parent / room for room in ("core", "place"))]
+    sources = [source for room in rooms for source in sorted(room.rglob("*.py"))]
     seen = hashlib.sha256(f"{version('numpy')} {version('shapely')} {shapely.geos_version_string}".encode())
     for source in sources:
         seen.update(source.read_bytes())

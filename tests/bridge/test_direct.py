@@ -146,7 +146,7 @@ def at_socket(folder: Path) -> str:
 
 def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> None:
     """Killed and started again the episode comes to the hash of an undisturbed one."""
-    from scenarios.execution.run import episode
+    from scenarios.execution.run import run_episode
 
     write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-0"),)), tmp_path / "tiny.json")
     (tmp_path / "killer.py").write_text(KILLER)
@@ -157,7 +157,7 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
             [*WORDS, *words, "--director-wait", str(LONGEST_WAIT_S)], cwd=tmp_path, stdout=subprocess.DEVNULL
         )
         try:
-            undisturbed = episode(frontal("t-0"), Blind()).record
+            undisturbed = run_episode(frontal("t-0"), Blind()).record
             assert first.wait(timeout=PATIENCE_S) == -9
             direct()
             assert run.wait(timeout=PATIENCE_S) == 0
@@ -214,9 +214,9 @@ def test_a_director_that_lies_crashes_its_episodes_and_no_other(tmp_path: Path, 
 
 def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cosim: Cosim) -> None:
     """Nobody there at first: the run says so, and goes on when somebody is; one that never comes is an error."""
-    from bridge.director import Outside
     from cosim.core.errors import DirectorLost
     from cosim.spec.events import EventQuery
+    from cosim.spec.options import Outside
     from scenarios.execution.directing import directed_by
 
     at = f"unixsock-stream/{tmp_path}/director.sock"

@@ -9,11 +9,11 @@ import pytest
 from rich.console import Console
 
 from cosim.cli.board import SETUP_M, Board, Left
-from scenarios.catalog import suite
+from scenarios.catalog import load_suite
 from scenarios.execution.messages import Compares, Done, Progress
 
-LONG = suite("long-horizon").scenarios
-SHORT = suite("reactive").scenarios
+LONG = load_suite("long-horizon").scenarios
+SHORT = load_suite("reactive").scenarios
 
 
 class Clock:

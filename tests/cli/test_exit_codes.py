@@ -80,7 +80,7 @@ def test_what_a_command_raises_is_its_exit_code(
     def raises(*_: object) -> None:
         raise raised
 
-    monkeypatch.setattr("scenarios.catalog.suite", raises)
+    monkeypatch.setattr("scenarios.catalog.load_suite", raises)
     assert ended(monkeypatch, "list") == code
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cosim.episode.log import Log
 from cosim.judge.metrics import METRICS, Episode, measure, progress_of
 from cosim.judge.referee import Failure
-from cosim.records.record import Log
 
 
 def log(s_m: list[float], *, resets: dict[int, float] | None = None, person_m: float = np.inf) -> Log:

@@ -20,7 +20,7 @@ from cosim.spec.scenario import CrowdSpec
 from physics.cameras.bullet_camera import BulletCamera
 from physics.world.world import BulletWorld
 from scenarios.builders.sample import suite_on_map
-from scenarios.execution.run import episode
+from scenarios.execution.run import run_episode
 from sumo_nets.maps.mapstore import checked_map, import_map
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.netfile import read_net
@@ -147,5 +147,5 @@ def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     heights = street_map.terrain.height(np.array(way))
     top = int(heights.argmax())
     assert heights[top] - heights[0] > 3.0 and heights[top] - heights[-1] > 1.5
-    done = episode(scenario, Unseeing())
+    done = run_episode(scenario, Unseeing())
     assert (done.record.ended, done.record.failures) == ("goal", ())

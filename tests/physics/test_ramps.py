@@ -16,8 +16,8 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, Pose, wrap_angle
 from cosim.core.state import NO_VEHICLES, NOBODY, STILL, Command, Street
 from cosim.episode.driver import Driver
-from cosim.episode.loop import observe, place_on_route
-from cosim.episode.ports import Privileged
+from cosim.episode.loop import place_on_route
+from cosim.episode.ports import Observation, Privileged
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip, WalkableArea
 from cosim.policies.route import Route
@@ -80,7 +80,8 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
     while reached < line.length_m - 0.4 and clock.time_s(tick) < 5.0 + 2.5 * line.length_m / V_MPS:
         if clock.acts(tick):
             known = Privileged(state, line, reached, NOBODY, NO_VEHICLES, {}, (), free)
-            command = driver.act(observe(tick, clock, state, None, known))
+            seen = Observation(tick, clock.time_s(tick), None, state.v_mps, state.w_radps, known)
+            command = driver.act(seen)
         state = world.step(command, street, street, clock.substeps).robot
         reached = place_on_route(line, state.pose, reached)
         tilt, tick = max(tilt, state.tilt_rad), tick + 1

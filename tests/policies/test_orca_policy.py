@@ -130,12 +130,12 @@ def test_the_reference_solver_solves_every_event(kind: Kind, seed: int) -> None:
     from cosim.place.walk_graph import WalkGraph
     from scenarios.builders.reactive import build
     from scenarios.execution.places import place
-    from scenarios.execution.run import episode
+    from scenarios.execution.run import run_episode
 
     _, street_map = place(CITY)
     whole = build(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
     scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
-    record = episode(scenario, Orca()).record
+    record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
     assert record.measures["success"] == 1.0
     assert record.ended == ("stop" if kind == "gesturing" else "goal")
@@ -149,7 +149,7 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
     from cosim.place.walk_graph import WalkGraph
     from scenarios.builders.reactive import build
     from scenarios.execution.places import place
-    from scenarios.execution.run import episode
+    from scenarios.execution.run import run_episode
 
     class Blind:
         manifest = Manifest("blind", camera=None)
@@ -161,5 +161,5 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
             return Command(1.2, 0.0)
 
     _, street_map = place(CITY)
-    record = episode(build("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()).record
+    record = run_episode(build("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()).record
     assert record.ended == "failure" and record.failures[0].other == "e0"

@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import RunError, UsageError
+from cosim.episode.log import Log
 from cosim.judge.metrics import METRICS
-from cosim.records.record import Log, Record
+from cosim.records.record import Record
 from cosim.records.results import summary_of, table_of
 from cosim.records.run_folder import RunFolder, RunSpec, read_records, read_spec
 from cosim.spec.scenario import City, Scenario, Suite
@@ -183,7 +184,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
         path = tmp_path / lost
         code = (
             "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
-            "from test_runfolder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, SUITE).__enter__();"
+            "from test_run_folder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, SUITE).__enter__();"
             "keep = sqlite3.connect(held.path / 'results.sqlite'); keep.execute('select * from episodes').fetchall();"
             "held.episode_folder('s-1').mkdir(); record('s-1').save(held.episode_folder('s-1') / 'record.json');"
             "held.adopt('s-1'); os.kill(os.getpid(), 9)"

@@ -14,7 +14,7 @@ from rich.console import Console
 from cosim.cli.tables import BY_KIND, COUNTS, LETTERS, SHOWN, print_by_kind, print_scenarios, print_sheet, print_table
 from cosim.core.errors import unknown
 from cosim.spec.scenario import CityMap, Suite
-from scenarios.catalog import SUITES, suite
+from scenarios.catalog import SUITES, load_suite
 from scenarios.viewing.eventsheet import COLUMNS
 
 
@@ -27,15 +27,15 @@ def terminal() -> tuple[Console, io.StringIO]:
 def test_the_scenarios_of_a_suite_fit_80_columns(name: str) -> None:
     """No name and no number is cut, and every scenario has a line with its place."""
     out, said = terminal()
-    print_scenarios(out, suite(name))
+    print_scenarios(out, load_suite(name))
     assert "…" not in said.getvalue()
-    for scenario in suite(name).scenarios:
+    for scenario in load_suite(name).scenarios:
         assert f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
 
 
 def test_a_name_with_brackets_is_shown_as_it_is() -> None:
     """What would end or begin a colour is part of the name of a map."""
-    (scenario,) = suite("long-horizon").scenarios[:1]
+    (scenario,) = load_suite("long-horizon").scenarios[:1]
     odd = msgspec.structs.replace(scenario, place=CityMap(map="[/x][red]"))
     out, said = terminal()
     print_scenarios(out, Suite(name="s", version="1", scenarios=(odd,)))
@@ -110,7 +110,7 @@ def test_the_sheet_of_events_fits_80_columns() -> None:
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
     """A hundred and sixty scenarios are no answer to a slip of the pen: five are, and how many there are."""
-    names = [scenario.id for scenario in suite("reactive").scenarios]
+    names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
     assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 160" in str(
         unknown("scenario", "x", names)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cosim.records.record import Log, Record
+from cosim.episode.log import Log
+from cosim.records.record import Record
 from cosim.spec.events import Event, Kind
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary

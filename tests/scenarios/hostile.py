@@ -1,6 +1,6 @@
 """Policies that do what no policy should: each a function, called in place of the third answer of an episode.
 
-One class drives all of them: the scenario's name says which one. Run by tests/test_hostile.py in real processes.
+One class drives all of them: the scenario's name says which one. Run by test_hostile.py in real processes.
 """
 
 from __future__ import annotations

@@ -18,15 +18,15 @@ from cosim.policies.load import load_policy
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder, RunSpec
 from cosim.spec.events import EventReply
+from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.builders.crossings import build_all
 from scenarios.execution.messages import Compares, Done, Message, Progress
 from scenarios.execution.places import place
 from scenarios.execution.pool import run_all
-from scenarios.execution.run import episode
-from sumo_nets.crowd.crowd import SumoCrowd
+from scenarios.execution.run import run_episode
+from scenarios.execution.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
-from sumo_nets.crowd.demand_replay import StreetAgain
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
@@ -45,14 +45,12 @@ def scenario() -> Scenario:
 
 def streets(scenario: Scenario, robot: RobotState, absent: bool) -> tuple[list[Street], Entrances]:
     """Half a minute around a robot that stands, or does not, where it is put."""
-    net, street_map = place(scenario.place)
-    with SumoCrowd(net, street_map, scenario.crowd, scenario.seed, OPEN, scenario.start[:2]) as crowd:
+    with crowd_of(scenario) as crowd:
         return [crowd.step(robot, nobody(tick), absent=absent) for tick in range(TICKS)], crowd.entrances
 
 
 def once_more(scenario: Scenario, robot: RobotState, entrances: Entrances) -> list[Street]:
-    net, street_map = place(scenario.place)
-    with StreetAgain(net, street_map, scenario, entrances) as crowd:
+    with crowd_of(scenario, entrances) as crowd:
         return [crowd.step(robot, nobody(tick), absent=True) for tick in range(TICKS)]
 
 
@@ -101,7 +99,7 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, t
     assert done.returncode == 0, done.stderr
     assert "against the same street without the robot" in done.stdout
     row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
-    plain = episode(short, load_policy("orca"), suite_hash=str(row["suite_hash"])).record
+    plain = run_episode(short, load_policy("orca"), EpisodeOptions(suite_hash=str(row["suite_hash"]))).record
     asked = Record.load(tmp_path / "asked" / "episodes" / scenario.id / "record.json")
     names = ["people_delay_s", "people_compared", "vehicles_delay_s", "vehicles_compared"]
     assert asked.state_hash == plain.state_hash
@@ -128,7 +126,8 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     )
     told: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
-        run_all(folder, short.scenarios, "orca", driver, jobs=1, tell=told.append)
+        options = EpisodeOptions(camera="bullet", counterfactual=True)
+        run_all(folder, short.scenarios, "orca", driver, jobs=1, tell=told.append, options=options)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
 
@@ -141,7 +140,7 @@ def test_an_episode_outlives_its_comparison(scenario: Scenario, monkeypatch: pyt
 
     monkeypatch.setattr("scenarios.execution.run.Beside.compared", fails)
     short = msgspec.structs.replace(scenario, time_limit_s=1.0)
-    outcome = episode(short, load_policy("orca"), counterfactual=True)
+    outcome = run_episode(short, load_policy("orca"), EpisodeOptions(counterfactual=True))
     assert outcome.record.status == "done" and outcome.log is not None and "fails" in outcome.traceback
     assert outcome.record.reason == "the street without the robot: KeyError: 'v7'"
     assert "people_delay_s" not in outcome.record.measures

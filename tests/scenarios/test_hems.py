@@ -18,9 +18,9 @@ from cosim.spec.scenario import City, content_hash
 from scenarios.builders import long_horizon
 from scenarios.builders.barriers import barrier_at, branches, outline, prove_single_path
 from scenarios.builders.hems import MOST, hem
-from scenarios.catalog import suite
+from scenarios.catalog import load_suite
 from scenarios.execution.places import place
-from tests.test_scenarios import cross_map
+from tests.scenarios.test_scenarios import cross_map
 
 WAY = [Port("west", 0), Port("east", 0)]
 ROUTE = Polyline([(-30, 0), (30, 0)])
@@ -104,7 +104,7 @@ def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
 @pytest.mark.engine
 def test_shipped_routes_are_drawn_again_to_the_bit() -> None:
     """Where a draw fits, the search changes nothing."""
-    shipped = {s.id: s for s in suite("long-horizon").scenarios}
+    shipped = {s.id: s for s in load_suite("long-horizon").scenarios}
     for name in ("lh-011-00", "lh-011-02"):
         scenario = shipped[name]
         where = msgspec.structs.replace(scenario.place, net_hash="")

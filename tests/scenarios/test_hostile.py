@@ -20,7 +20,7 @@ import pytest
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from tests.conftest import PATIENCE_S, WIDE, Cosim, Said
-from tests.hostile import ACTS, FLOOD_BYTES, RESETS
+from tests.scenarios.hostile import ACTS, FLOOD_BYTES, RESETS
 
 pytestmark = pytest.mark.engine
 
@@ -91,7 +91,7 @@ class War(NamedTuple):
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite that has one short scenario for each of them, and the policies."""
     from scenarios.builders.reactive import build
-    from scenarios.execution.assemble import place
+    from scenarios.execution.places import place
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
@@ -140,7 +140,7 @@ def record(war: War, name: str) -> dict[str, object]:
 
 
 def test_every_hostile_policy_is_expected() -> None:
-    """The table names each function of tests/hostile.py, and they are many."""
+    """The table names each function of tests/scenarios/hostile.py, and they are many."""
     assert set(EXPECTED) == set(ACTS) | set(RESETS)
     assert len(EXPECTED) >= 45
 

@@ -12,11 +12,11 @@ from cosim.core.versions import versions
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder, RunSpec
 from cosim.spec.scenario import Scenario, Suite
-from scenarios.catalog import suite
+from scenarios.catalog import load_suite
 from scenarios.execution import pace
 from scenarios.execution.pace import Estimate, Measured, announcement, estimate, makespan, recall, remembered, span
 
-LONG = suite("long-horizon").scenarios
+LONG = load_suite("long-horizon").scenarios
 GL = "gl: llvmpipe"
 
 

@@ -31,7 +31,7 @@ from physics.street.placement import CLEAR_HALF_M
 from physics.world.ground import Ground
 from physics.world.tiles import key_at
 from scenarios.builders.barriers import outline
-from scenarios.catalog import suite, with_crowd
+from scenarios.catalog import load_suite, with_crowd
 from scenarios.residents.director import GONE_M, WITHIN_M, Residents
 from scenarios.residents.graph import OFF_WALK_M, BehaviorGraph, behavior_graph
 from scenarios.residents.resident import SPEED_MPS, STAYS_S, Resident
@@ -304,7 +304,7 @@ def test_they_come_and_go_out_of_sight() -> None:
 
 def test_the_same_seed_lives_the_same_life_in_another_process() -> None:
     """Positions of every tick are the same bits, under another salt of Python's hashes; another seed differs."""
-    code = "from tests.test_residents import trace; print(trace(7))"
+    code = "from tests.scenarios.test_residents import trace; print(trace(7))"
     environment = os.environ | {"PYTHONHASHSEED": "321", "PYTHONPATH": str(Path(__file__).parents[2])}
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
     assert done.stdout.split()[-1] == trace(7) != trace(8)
@@ -320,7 +320,7 @@ def trace(seed: int) -> str:
 
 def test_a_crowd_without_residents_is_what_it_was() -> None:
     """Specs that do not ask for residents keep their hashes; those that do, come back from their file."""
-    shipped = suite("long-horizon")
+    shipped = load_suite("long-horizon")
     proven = msgspec.json.decode((Path(__file__).parents[2] / "scenarios/suites/long-horizon.proof.json").read_bytes())
     assert content_hash(shipped.scenarios[0]) == proven[0]["scenario_hash"]
     settled = with_crowd(shipped, residents=8)
@@ -339,16 +339,16 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     from cosim.judge.referee import Verdict
     from cosim.policies.load import load_policy
     from scenarios.execution.replay import Recorded, compared
-    from scenarios.execution.run import episode
+    from scenarios.execution.run import run_episode
 
-    whole = with_crowd(suite("long-horizon"), residents=6)
+    whole = with_crowd(load_suite("long-horizon"), residents=6)
     scenario = msgspec.structs.replace(whole.scenarios[0], time_limit_s=10.0)
     names: set[str] = set()
 
     def watch(step: Step, verdict: Verdict) -> None:
         names.update(name for name in step.street_after.people.ids if name.startswith("n"))
 
-    outcome = episode(scenario, load_policy("orca"), watch=watch)
+    outcome = run_episode(scenario, load_policy("orca"), watches=[watch])
     assert outcome.log is not None and outcome.record.status == "done", outcome.record.reason
     assert len(names) >= 6 and outcome.log.people_resident.any()
     state_hash, without = compared(Recorded(scenario, outcome.record, outcome.log))

@@ -15,10 +15,10 @@ from shapely.geometry import LineString, Point, Polygon, box
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Polyline
-from cosim.core.state import NO_VEHICLES, NOBODY, RobotState
+from cosim.core.state import NO_VEHICLES, NOBODY, RobotState, Street
 from cosim.episode.control import Limits
 from cosim.episode.driver import Driver
-from cosim.episode.loop import query
+from cosim.episode.loop import Moment, query
 from cosim.episode.ports import Privileged
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.place.walk_graph import WalkGraph
@@ -29,16 +29,16 @@ from scenarios.builders.barriers import barrier_at, branches, fenced, prove_sing
 from scenarios.builders.build import Proof
 from scenarios.builders.long_horizon import build, on_road_m
 from scenarios.builders.sample import suite_on_map, thinned
-from scenarios.catalog import SUITES, chosen, suite
+from scenarios.catalog import SUITES, chosen, load_suite
 from scenarios.events import BEHAVIORS, react
 from sumo_nets.maps.mapstore import read_map
 
-LONG = suite("long-horizon").scenarios
+LONG = load_suite("long-horizon").scenarios
 
 
 def test_the_long_horizon_suite_is_what_it_promises() -> None:
     """At least ten scenarios in at least three cities, each longer than 100 m, each solved by the expert."""
-    whole = suite("long-horizon")
+    whole = load_suite("long-horizon")
     assert len(whole.scenarios) >= 10
     assert len({s.place.name for s in whole.scenarios}) >= 3
     for scenario in whole.scenarios:
@@ -49,7 +49,7 @@ def test_the_long_horizon_suite_is_what_it_promises() -> None:
 
 def test_the_reactive_suite_is_what_it_promises() -> None:
     """Each event in twenty cities, one each; 10 to 20 m of way; nothing triggers where the robot starts."""
-    whole = suite("reactive")
+    whole = load_suite("reactive")
     cities = {scenario.place.name for scenario in whole.scenarios}
     assert len(cities) == 20
     places = {kind: [s.place.name for s in whole.scenarios if s.events[0].kind == kind] for kind in BEHAVIORS}
@@ -70,7 +70,7 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
 
 def first_query(scenario: Scenario) -> EventQuery:
     """What a director is asked at the first tick."""
-    return query(scenario, Clock(), 0, RobotState(scenario.start_pose), NOBODY, 0.0, (0.7, 0.55), ())
+    return query(scenario, Clock(), Moment(0, RobotState(scenario.start_pose), Street(0), 0.0), (0.7, 0.55))
 
 
 @pytest.mark.parametrize("name", SUITES)
@@ -78,13 +78,13 @@ def test_every_scenario_comes_with_its_proof(name: str) -> None:
     """The proofs beside a suite are of these very scenarios."""
     proofs = msgspec.json.decode(SUITES[name].with_suffix(".proof.json").read_bytes(), type=list[Proof])
     assert {proof.scenario: proof.scenario_hash for proof in proofs} == {
-        s.id: content_hash(s) for s in suite(name).scenarios
+        s.id: content_hash(s) for s in load_suite(name).scenarios
     }
 
 
 def test_scenarios_are_chosen_by_event() -> None:
     """All with an event of the kinds asked for; a kind that is not there is answered with those that are."""
-    whole = suite("reactive")
+    whole = load_suite("reactive")
     assert {s.events[0].kind for s in chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
     assert [s.events[0].kind for s in chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
     with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
@@ -93,7 +93,7 @@ def test_scenarios_are_chosen_by_event() -> None:
 
 def test_a_suite_survives_its_file(tmp_path: Path) -> None:
     """Writing and reading a suite changes nothing, its hash included."""
-    whole = suite("long-horizon")
+    whole = load_suite("long-horizon")
     write_suite(whole, tmp_path / "s.json")
     again = read_suite(tmp_path / "s.json")
     assert again == whole and again.content_hash == whole.content_hash
@@ -139,7 +139,7 @@ def test_fewer_people_walk_where_sidewalks_are_few() -> None:
 def test_free_space_ends_at_furniture() -> None:
     """Where a prop stands on walkable ground it is cut out; where none does the area is the same object."""
     from physics.street.furniture import Prop, footprints
-    from scenarios.execution.assemble import clear_of
+    from scenarios.execution.wiring import clear_of
 
     area = cross_map().walkable
     post = Prop("prop:east:0", "lamp", 0, 20.0, 1.2, 0.0, 0)
@@ -302,7 +302,7 @@ def test_the_walking_graph_agrees_with_the_branches() -> None:
 
 def test_two_pedestrians_of_one_name_are_refused() -> None:
     """The second of a group "e0" is "e0-1": no other event may be called so."""
-    one = suite("reactive").scenarios[0]
+    one = load_suite("reactive").scenarios[0]
     two = [
         Event(id=name, kind="queueing", x_m=0, y_m=0, heading_rad=0, route_s_m=5, half_width_m=2, people=2)
         for name in ("e0", "e0-1")

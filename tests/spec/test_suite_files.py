@@ -15,7 +15,7 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.spec.scenario import City, Suite, read_suite
-from scenarios.catalog import SUITES, suite
+from scenarios.catalog import SUITES, load_suite
 from tests.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
@@ -24,8 +24,8 @@ PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|n
 
 def sound() -> dict[str, Any]:
     """The file of a suite of three: a long way with barriers, crossings and events, and two short ones with groups."""
-    chosen = [suite("long-horizon").scenarios[0]]
-    chosen += [s for s in suite("reactive").scenarios if s.id in ("ped_crossing-001", "conversing-001")]
+    chosen = [load_suite("long-horizon").scenarios[0]]
+    chosen += [s for s in load_suite("reactive").scenarios if s.id in ("ped_crossing-001", "conversing-001")]
     return json.loads(msgspec.json.encode(Suite(name="sound", version="1", scenarios=tuple(chosen))))  # type: ignore[no-any-return]
 
 
@@ -128,7 +128,7 @@ def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
     assert refusal(tmp_path / "s.json", json.dumps(whole)).splitlines() == [
         "5 faults:",
         "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: " + ", ".join(
-            sorted(first.keys() - {"gaol"}, key=list(msgspec.to_builtins(suite("reactive").scenarios[0])).index)
+            sorted(first.keys() - {"gaol"}, key=list(msgspec.to_builtins(load_suite("reactive").scenarios[0])).index)
         ),
         "  Expected `int`, got `str` - at `$.scenarios[0].seed`",
         "  crowd persons must be in [0, 1000], not -1; crowd groups must be a share in [0, 1], not 2.0"
@@ -184,7 +184,7 @@ def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_ea
 
         __hash__ = str.__hash__
 
-    one = suite("reactive").scenarios[0]
+    one = load_suite("reactive").scenarios[0]
     scenarios = tuple(msgspec.structs.replace(one, id=Counting(f"s-{i}")) for i in [*range(300), 41])
     with pytest.raises(SpecError, match="suite 'big' lists scenarios twice: s-41"):
         Suite(name="big", version="1", scenarios=scenarios)
@@ -194,4 +194,4 @@ def test_a_scenario_that_is_listed_twice_is_found_without_comparing_each_with_ea
 @pytest.mark.parametrize("name", SUITES)
 def test_the_shipped_suites_keep_their_ranges(name: str) -> None:
     """They are read without a word."""
-    assert suite(name).scenarios
+    assert load_suite(name).scenarios

@@ -23,7 +23,7 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.builders.crossings import AFTER_M, BEFORE_M, build_all
 from scenarios.execution.places import place
-from scenarios.execution.run import episode
+from scenarios.execution.run import run_episode
 from sumo_nets.crowd.crowd import SumoCrowd
 from tests.conftest import Cosim
 
@@ -134,7 +134,7 @@ def test_cars_brake_for_a_robot_that_walks_at_red_and_are_counted() -> None:
             if name in braking or name in slowest:
                 slowest[name] = min(slowest.get(name, 99.0), speed_mps)
 
-    measures = episode(busy, Heedless(), watch=watch).record.measures
+    measures = run_episode(busy, Heedless(), watches=[watch]).record.measures
     assert measures["red_light_entries"] == 1
     assert measures["vehicles_braked"] == 1 and min(slowest.values()) < 0.1
     assert measures["collisions_vehicle"] == 0

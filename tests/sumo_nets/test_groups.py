@@ -18,7 +18,7 @@ from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.bench.group_tally import widest_gaps
-from scenarios.catalog import suite, with_crowd
+from scenarios.catalog import load_suite, with_crowd
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.group_cohesion import Together
@@ -178,7 +178,7 @@ def test_the_gap_of_a_group_is_that_of_its_loneliest_member() -> None:
 
 def test_a_suite_can_be_asked_for_groups() -> None:
     """`--groups 0.4` makes another suite, whose version says so; nothing asked leaves it; children need groups."""
-    shipped = suite("reactive")
+    shipped = load_suite("reactive")
     asked = with_crowd(shipped, groups=0.4, children=None)
     assert {scenario.crowd.groups for scenario in asked.scenarios} == {0.4}
     assert asked.version == f"{shipped.version}-groups0.4" and asked.content_hash != shipped.content_hash

@@ -25,7 +25,7 @@ from sumo_nets.maps.mapstore import ABOUT, about_map, import_map, known_maps, ma
 from sumo_nets.maps.place_names import place_called
 from sumo_nets.maps.scratch import HELD, PREFIX, move_in, scratch_in
 from tests.conftest import PATIENCE_S, Cosim
-from tests.test_damaged_maps import TOWN
+from tests.sumo_nets.test_damaged_maps import TOWN
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -22,9 +22,9 @@ edge; the bullet camera does the same."""
 
 @dataclass(frozen=True, slots=True)
 class Lighting:
-    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that looks
-    there; horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky; lamps: 0 by day to 1 at night;
-    shadows: whether there are any."""
+    """Linear radiances, as in physics.cameras.sky. to_sun: (3,); up, side, down: (3,) ambient of a white surface that
+    looks there; horizon: (N, 3) the sky just over the horizon, columns as in physics.cameras.sky; lamps: 0 by day to 1
+    at night; shadows: whether there are any."""
 
     to_sun: Floats
     sun: Floats

@@ -1,4 +1,4 @@
-"""The street around a view for the gl camera: the same sets of things as physics.cameras.scene, as buffers and instances."""
+"""The street around a view for the gl camera: the same things as in physics.cameras.scene, as buffers and instances."""
 
 from __future__ import annotations
 

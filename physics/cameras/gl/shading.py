@@ -40,8 +40,8 @@ A drawable takes part in a pass by
 
 drawing itself with its program of that stage: "colour"; "still", the shadows of what stands, drawn anew only
 when the eye has moved on; "moving", the shadows of what moves, drawn for every picture. A drawable that casts no shadow
-of a kind returns at once. Back faces are culled in the picture; front faces are counter-clockwise as in physics.world.mesh.
-"""
+of a kind returns at once. Back faces are culled in the picture; front faces are counter-clockwise as in
+physics.world.mesh."""
 
 from __future__ import annotations
 

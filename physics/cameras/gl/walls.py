@@ -1,9 +1,8 @@
 """Buildings of a tile as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
 
-What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and which fronts a building has
-hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all along, and
-doors at even distances.
-"""
+What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and which fronts a
+building has hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all
+along, and doors at even distances."""
 
 from __future__ import annotations
 

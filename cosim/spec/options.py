@@ -1,0 +1,40 @@
+"""How an episode is run, beyond what its scenario says: one value from the command line to the worker."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from cosim.spec.injection import Injected, Live
+
+CameraName = Literal["gl", "bullet", "bullet-egl"]
+CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
+
+
+class Outside(msgspec.Struct, frozen=True, kw_only=True):
+    """A director in a process of its own. endpoint: where it listens; run: the run's name in the keys; wait_s: how long
+    an episode waits for it before it is recorded as crashed."""
+
+    endpoint: str
+    run: str
+    wait_s: float
+
+
+class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
+    """How an episode is run. Options change what is seen and kept, never what happens in the street.
+
+    suite_hash, policy_source: of the suite that the scenario is of and of the file of the policy, for the record.
+    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
+    is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
+    compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
+    one replays."""
+
+    suite_hash: str = ""
+    policy_source: str = ""
+    camera: CameraChoice = "auto"
+    frames_every_s: float = 0.0
+    live: Live | None = None
+    director: Outside | None = None
+    counterfactual: bool = False
+    injections: tuple[Injected, ...] = ()

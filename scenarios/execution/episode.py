@@ -1,0 +1,203 @@
+"""Episode: a scenario that one can hold, and drive period by period of the policy.
+
+    with Episode(scenario, policy.manifest) as episode:
+        policy.reset(scenario.id, scenario.seed)
+        observation = episode.reset()
+        while not episode.over:
+            observation = episode.advance(policy.act(observation))
+    record, log = episode.result()
+
+It is the only wiring of engines, referee, recorder and event monitor: runs, films, replays, measurements and
+environments drive it. The policy stands outside.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
+from types import TracebackType
+from typing import Self
+
+import msgspec
+
+from cosim.core.clock import Clock
+from cosim.core.errors import PolicyError, UsageError
+from cosim.core.state import STILL, Frame
+from cosim.episode.control import command_of
+from cosim.episode.log import Log
+from cosim.episode.loop import Moment, after, begin, tick
+from cosim.episode.ports import CameraSpec, Eyes, Manifest, Observation
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.records.record import Record, begun
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Scenario
+from scenarios.execution.on_air import OnAir
+from scenarios.execution.wiring import Stage, staged
+from sumo_nets.crowd.demand_log import Entrances
+
+Watch = Callable[[Step, Verdict], None]
+"""Told each Step of an episode, and what the referee says of it."""
+
+
+def unheard(reason: str) -> None:
+    """Nobody wants to know."""
+
+
+class Episode:
+    """One episode of a scenario, for a policy with this manifest. Use it in a `with` block: its engines start on
+    entering and are closed whatever happens. One at a time in a process, because SUMO runs once in each.
+
+    watches: told every tick. waiting: told what the episode waits for when it stands still. through: may
+    put stopwatches or stand-ins before the engines, which have started and not begun.
+
+    Raises UsageError when it is used out of turn, PolicyError for an answer that is no command, EngineError when an
+    engine fails or runs already, and what its place raises.
+    """
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        manifest: Manifest,
+        options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
+        *,
+        watches: Sequence[Watch] = (),
+        waiting: Callable[[str], None] = unheard,
+        through: Callable[[Stage], None] | None = None,
+    ) -> None:
+        self.scenario, self.manifest, self.options = scenario, manifest, options
+        self.clock = Clock.for_rate(manifest.rate_hz)
+        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source)
+        self._watches, self._waiting, self._through = list(watches), waiting, through
+        self._began_s = time.perf_counter()
+        self._setup_s = 0.0
+        self._stack = ExitStack()
+        self._stage: Stage | None = None
+        self._now: Moment | None = None
+        self._frame: Frame | None = None
+        self._verdict = Verdict()
+        self._result: tuple[Record, Log] | None = None
+
+    def __enter__(self) -> Self:
+        if self._setup_s:
+            raise UsageError("this Episode was used before: make a new Episode for every run of a scenario")
+        with ExitStack() as stack:
+            stage = stack.enter_context(staged(self.scenario, self.manifest, self.options, self.clock, self._waiting))
+            if self._through is not None:
+                self._through(stage)
+            if self.options.live is not None:
+                air = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
+                self._watches.append(air.tell)
+            self._stack = stack.pop_all()
+        self._stage, self._scorer, self._injected = stage, stage.scorer, stage.injected
+        self.record = msgspec.structs.replace(self.record, renderer=stage.renderer)
+        self._setup_s = time.perf_counter() - self._began_s
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End every engine; a second call does nothing. `result` can still be asked for."""
+        self._stack.close()
+        self._stage = None
+
+    def watch(self, watch: Watch) -> None:
+        """Tell somebody else too of every tick from now on."""
+        self._watches.append(watch)
+
+    @property
+    def over(self) -> bool:
+        """Whether the referee has ended it."""
+        return self._verdict.ended is not None
+
+    @property
+    def time_s(self) -> float:
+        """Simulated seconds since its start."""
+        return 0.0 if self._now is None else self.clock.time_s(self._now.tick)
+
+    @property
+    def moment(self) -> Moment:
+        """Where everything is now."""
+        return self._begun[1]
+
+    @property
+    def footprint_m(self) -> tuple[float, float]:
+        """Length and width of the robot."""
+        return self._open.parts.world.footprint_m
+
+    @property
+    def entrances(self) -> Entrances:
+        """Who has come into the street and left it so far."""
+        return self._open.entrances
+
+    def eyes(self, spec: CameraSpec) -> AbstractContextManager[Eyes]:
+        """A further camera in its street, for humans."""
+        return self._open.eyes(spec)
+
+    def reset(self) -> Observation:
+        """Put the robot at its start; what the policy sees there. Raises UsageError when that was done."""
+        stage = self._open
+        if self._now is not None:
+            raise UsageError("this Episode has begun: an episode cannot be begun anew, make another Episode for that")
+        self._now = begin(self.scenario, stage.parts)
+        return self._observe(stage, self._now)
+
+    def advance(self, answer: object, *, until_tick: int | None = None) -> Observation:
+        """Go on for one period of the policy with its answer; what it sees then, or at the end of the episode.
+
+        answer: a Command or waypoints; see `cosim.episode.control.command_of`. until_tick: stop there, within the
+        period, for somebody who wants to look.
+        """
+        stage, now = self._begun
+        if self.over:
+            raise UsageError(f"this Episode is over ({self._verdict.ended}): ask for its result(), or make another")
+        try:
+            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, limits=stage.limits)
+        except PolicyError as error:
+            raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
+        frame = self._frame
+        while True:
+            step = tick(self.scenario, self.clock, stage.parts, now, command, frame)
+            self._verdict = verdict = stage.scorer.score(step)
+            for watch in self._watches:
+                watch(step, verdict)
+            self._now = now = after(step, verdict.reset, stage.parts)
+            if self.over or self.clock.acts(now.tick) or now.tick == until_tick:
+                return self._observe(stage, now)
+            frame, command = None, command if verdict.reset is None else STILL
+
+    def result(self) -> tuple[Record, Log]:
+        """What came out: the record and the log. Raises UsageError while the episode goes on."""
+        if not self.over:
+            raise UsageError("this Episode is not over: advance() it until `over`, then ask for its result()")
+        if self._result is None:
+            record, log = self._scorer.result(self.record)
+            clock = {"wall_s": time.perf_counter() - self._began_s, "setup_s": self._setup_s}
+            self._result = msgspec.structs.replace(record, injections=self._injected.log, clock=clock), log
+        return self._result
+
+    def _observe(self, stage: Stage, now: Moment) -> Observation:
+        """What the policy is given now; what the simulator knows only to a policy whose manifest asks for it."""
+        parts = stage.parts
+        self._frame = parts.camera.render(now.robot, now.street) if parts.camera is not None else None
+        known = stage.known(now) if self.manifest.privileged else None
+        rgb = self._frame.rgb if self._frame is not None else None
+        return Observation(now.tick, self.clock.time_s(now.tick), rgb, now.robot.v_mps, now.robot.w_radps, known)
+
+    @property
+    def _open(self) -> Stage:
+        if self._stage is None:
+            what = (
+                "is closed: make another Episode" if self._setup_s else "has not been entered: use it in a `with` block"
+            )
+            raise UsageError(f"this Episode {what}")
+        return self._stage
+
+    @property
+    def _begun(self) -> tuple[Stage, Moment]:
+        stage = self._open
+        if self._now is None:
+            raise UsageError("this Episode has not begun: call reset() first, it gives the first observation")
+        return stage, self._now

@@ -1,0 +1,78 @@
+"""Scorer: what is judged, measured and recorded of an episode, Step by Step."""
+
+from __future__ import annotations
+
+import msgspec
+
+from cosim.core.clock import Clock
+from cosim.episode.log import Log
+from cosim.episode.step import Step
+from cosim.judge.event_monitor import Witness, unwitnessed
+from cosim.judge.metrics import Episode, measure
+from cosim.judge.referee import Failure, Referee, Verdict
+from cosim.judge.traffic import Roadway
+from cosim.place.street_map import StreetMap, WalkableArea
+from cosim.records.record import Record, Recorder, TriggeredEvent
+from cosim.spec.scenario import Scenario
+
+
+class Scorer:
+    """Takes in the Steps of one episode, in order. area: where the robot may be; footprint_m: its length and width."""
+
+    def __init__(
+        self,
+        scenario: Scenario,
+        street_map: StreetMap,
+        area: WalkableArea,
+        footprint_m: tuple[float, float],
+        clock: Clock,
+    ) -> None:
+        self._scenario = scenario
+        self._referee = Referee(scenario, area, footprint_m, clock)
+        self._recorder = Recorder(clock.tick_s)
+        self._monitor = Witness(scenario, clock.tick_ms)
+        self._traffic = Roadway(street_map, clock.tick_s)
+        self._failures: list[Failure] = []
+        self._red_lights = 0
+        self._verdict = Verdict()
+
+    def score(self, step: Step) -> Verdict:
+        """The referee's verdict on a Step, which is recorded with it."""
+        verdict = self._verdict = self._referee.judge(step)
+        self._recorder.add(step, verdict, self._traffic.see(step))
+        self._monitor.see(step)
+        if verdict.failure is not None:
+            self._failures.append(verdict.failure)
+        self._red_lights += verdict.red_light_entry is not None
+        return verdict
+
+    def result(self, begun: Record) -> tuple[Record, Log]:
+        """The record that was begun, with all that came out so far, and the log."""
+        scenario, log, events = self._scenario, self._recorder.log(self._monitor.tracks), self._monitor.outcomes()
+        broken = sum(event.rule_met is False for event in events)
+        ended, failures = self._verdict.ended, tuple(self._failures)
+        seen = Episode(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken)
+        reason = unseen(scenario, events)
+        record = msgspec.structs.replace(
+            begun,
+            status="invalid" if reason else "done",
+            reason=reason,
+            ended=ended,
+            ticks=len(log),
+            state_hash=self._recorder.hash.hexdigest(),
+            measures=measure(seen),
+            failures=failures,
+            events=events,
+        )
+        return record, log
+
+
+def unseen(scenario: Scenario, events: tuple[TriggeredEvent, ...]) -> str:
+    """Why an episode that is about its event says nothing about the robot; "" if it does.
+
+    A long way has events that a robot may fail to come to; there this makes nothing invalid.
+    """
+    if not scenario.ends_on_failure:
+        return ""
+    reasons = [unwitnessed(event, outcome) for event, outcome in zip(scenario.events, events, strict=True)]
+    return "; ".join(filter(None, reasons))

@@ -1,0 +1,119 @@
+"""run(suite, policy) -> table: a suite run from Python, in this process or in several, into a run folder or none."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+
+from cosim.core.errors import UsageError, unwritable
+from cosim.core.versions import versions
+from cosim.episode.driver import Driver
+from cosim.episode.ports import Policy
+from cosim.policies.load import load_policy
+from cosim.records.record import NO_RENDERER
+from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Scenario, Suite
+from physics.cameras.choice import chosen as chosen_camera
+from physics.cameras.choice import renderer_of
+from scenarios.builders.fits import check_places
+from scenarios.catalog import chosen, load_suite
+from scenarios.execution.asked import Patience
+from scenarios.execution.pool import run_all
+
+
+def run(
+    suite: Suite | str,
+    policy: Policy | str = "route",
+    *,
+    episodes: int | None = None,
+    scenarios: Sequence[str] = (),
+    events: Sequence[str] = (),
+    jobs: int = 1,
+    out: str | Path | None = None,
+    resume: bool = False,
+    options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
+) -> pd.DataFrame:
+    """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
+
+    suite: one that was loaded, or a name or path as for `load_suite`. policy: an object, which drives in this process,
+    one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes that
+    survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
+    out: the run folder, to be kept and resumed; without one only the table is.
+
+    Raises UsageError for names and options that do not exist, SpecError for scenarios that do not fit their places,
+    RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
+    with status "crashed".
+
+        table = cosim.run("reactive", MyPolicy(), episodes=2)
+        print(table[["scenario", "success", "route_completion"]])
+    """
+    whole = load_suite(suite) if isinstance(suite, str) else suite
+    picked = chosen(whole, scenarios, episodes, events)
+    check_places(whole, picked)
+    driver = load_policy(policy) if isinstance(policy, str) else Driver.of(policy)
+    if not isinstance(policy, str) and jobs != 1:
+        raise UsageError(
+            f"jobs={jobs} needs a policy by its name, such as 'package.module:Class': "
+            "every process makes one of its own; an object drives in this process alone"
+        )
+    name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
+    options = _settled(options, whole, driver)
+    spec = run_spec(whole, picked, name, driver, options)
+    with ExitStack() as stack:
+        folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+        held = RunFolder.resume(folder, spec) if resume else RunFolder.create(folder, spec, whole)
+        stack.enter_context(held)
+        done = held.finished()
+        todo = [scenario for scenario in picked if scenario.id not in done]
+        if isinstance(policy, str):
+            run_all(held, todo, policy, driver, jobs=jobs, tell=_untold, options=options, patience=Patience())
+        else:
+            run_here(held, todo, driver, options)
+        return held.finish()
+
+
+def run_here(held: RunFolder, todo: Sequence[Scenario], driver: Driver, options: EpisodeOptions) -> None:
+    """Run scenarios one after another in this process, adding each record to the folder as it ends."""
+    from scenarios.execution.run import keep, run_episode  # the engines, which a run in processes does without
+
+    for scenario in todo:
+        target = held.episode_folder(scenario.id)
+        try:
+            keep(run_episode(scenario, driver, options), target)
+        except OSError as error:
+            raise unwritable(target, error) from error
+        held.adopt(scenario.id)
+
+
+def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions) -> RunSpec:
+    """What a run is, for its folder. policy: its name."""
+    manifest = driver.manifest
+    return RunSpec(
+        suite=whole.name,
+        suite_version=whole.version,
+        suite_hash=whole.content_hash,
+        policy=policy,
+        policy_name=manifest.name,
+        policy_version=manifest.version,
+        policy_source=driver.source_hash,
+        scenarios=tuple(s.id for s in picked),
+        versions=versions(),
+        renderer=renderer_of(chosen_camera(options.camera)) if manifest.camera is not None else NO_RENDERER,
+        counterfactual=options.counterfactual,
+    )
+
+
+def _settled(options: EpisodeOptions, whole: Suite, driver: Driver) -> EpisodeOptions:
+    """Options with the suite's hash and the one camera of the run."""
+    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
+    return msgspec.structs.replace(options, suite_hash=whole.content_hash, camera=camera)
+
+
+def _untold(message: object) -> None:
+    """Nobody wants to know."""

@@ -1,0 +1,138 @@
+"""The only wiring of engines: a scenario becomes running parts, behind their ports."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+
+import shapely
+from shapely.geometry import LineString, MultiPolygon, Polygon
+
+from cosim.core.clock import Clock
+from cosim.episode.control import Limits
+from cosim.episode.loop import Moment, Parts
+from cosim.episode.ports import CameraSpec, Eyes, Manifest, Privileged
+from cosim.place import overlay
+from cosim.place.street_map import Port, StreetMap, WalkableArea
+from cosim.records.record import NO_RENDERER
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Barrier, Scenario
+from physics.cameras.choice import camera_of, chosen, renderer_of
+from physics.robots import robot
+from physics.street.furniture import Prop, footprints
+from physics.world.world import BulletWorld
+from scenarios.builders.barriers import fenced
+from scenarios.execution.directing import director_of
+from scenarios.execution.injected import Guests
+from scenarios.execution.places import place
+from scenarios.execution.scorer import Scorer
+from scenarios.residents.director import among_residents
+from sumo_nets.crowd.crowd import SumoCrowd
+from sumo_nets.crowd.demand_log import Entrances
+
+CORRIDOR_M = 40.0
+"""The walkable area is judged this far around the route; beyond it everything is out of lane."""
+
+FRONTAGE_M = 2.0
+"""Beside a sidewalk there is room for this much."""
+
+
+@dataclass(slots=True)
+class Stage:
+    """A scenario ready to run. parts: its engines; limits: of the robot. renderer: what draws for the policy. known:
+    all that the simulator knows at a moment. eyes: makes further cameras. injected: takes pedestrians in. entrances:
+    who comes and goes in the street."""
+
+    parts: Parts
+    limits: Limits
+    renderer: str
+    scorer: Scorer
+    known: Callable[[Moment], Privileged]
+    eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
+    injected: Guests
+    entrances: Entrances
+
+
+@contextmanager
+def staged(
+    scenario: Scenario,
+    manifest: Manifest,
+    options: EpisodeOptions,
+    clock: Clock,
+    waiting: Callable[[str], None],
+) -> Iterator[Stage]:
+    """Start every engine of a scenario; all are closed at the end, whatever happened."""
+    _, street_map = place(scenario.place)
+    around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
+    walkable = street_map.walkable_near(around)
+    with ExitStack() as stack:
+        place_seed, unevenness = scenario.place.seed, scenario.place.unevenness
+        world = world_of(street_map, place_seed, scenario.barriers, scenario.robot, unevenness)
+        stack.enter_context(world)
+        crowd = stack.enter_context(crowd_of(scenario))
+
+        def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
+            return camera_of(chosen(options.camera), world, spec, light=scenario.light)
+
+        camera, renderer = None, NO_RENDERER
+        if manifest.camera is not None:
+            camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(chosen(options.camera))
+        director = stack.enter_context(director_of(scenario.id, options.director, waiting))
+        director = among_residents(director, scenario, street_map, world.ground, lambda: crowd.street.people)
+        injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
+        footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
+        free = shapely.buffer(footing, -world.footprint_m[1] / 2)
+        shapely.prepare(free)
+        yield Stage(
+            parts=Parts(world, crowd, injected, camera),
+            limits=Limits(),
+            renderer=renderer,
+            scorer=Scorer(scenario, street_map, WalkableArea(walkable), world.footprint_m, clock),
+            known=partial(known, scenario, free),
+            eyes=eyes,
+            injected=injected,
+            entrances=crowd.entrances,
+        )
+
+
+def world_of(
+    street_map: StreetMap,
+    seed: int,
+    barriers: Sequence[Barrier] = (),
+    robot: str = "courier",
+    roughness: float = 0.0,
+) -> BulletWorld:
+    """The physics of a place, not running yet."""
+    return BulletWorld(street_map, seed, barriers, robot, roughness)
+
+
+def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd:
+    """The street life of a scenario, not running yet. before: who comes and goes, in place of who would be drawn."""
+    net_path, street_map = place(scenario.place)
+    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
+    model, start_xy = robot(scenario.robot), scenario.start[:2]
+    outline_m = (model.length_m, model.width_m)
+    return SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, outline_m, before)
+
+
+def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:
+    """All that the simulator knows at a moment."""
+    crossings = tuple((c.id, c.enter_s_m, c.leave_s_m) for c in scenario.crossings)
+    street = now.street
+    return Privileged(
+        now.robot, scenario.route_line, now.route_s_m, street.people, street.vehicles, street.signals, crossings, free
+    )
+
+
+def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
+    """Whether somebody may be there: on a street, or within FRONTAGE_M of one."""
+    return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
+
+
+def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:
+    """An area minus the ground that props cover; the area itself where none stands on it."""
+    ground = footprints(props)
+    ground = ground[shapely.intersects(area, ground)]
+    return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area

@@ -1,0 +1,65 @@
+"""`import cosim`: what it gives, what it costs, and what its documentation says."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import cosim
+
+ROOT = Path(__file__).parents[2]
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+
+
+def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
+    """A new process that imports cosim has loaded no other package, ours included: that is why it takes no time."""
+    told = subprocess.run(
+        [sys.executable, "-c", "import sys; old = set(sys.modules); import cosim; print(*set(sys.modules) - old)"],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=ROOT,
+    ).stdout.split()
+    strangers = {name.split(".")[0] for name in told} - set(sys.stdlib_module_names) - {"cosim"}
+    assert not strangers and {n for n in told if n.startswith("cosim")} == {"cosim"}
+
+
+@pytest.mark.parametrize("name", cosim.__all__)
+def test_every_public_name_is_there_and_documented(name: str) -> None:
+    """Every name of `__all__` can be had and says what it is."""
+    assert (getattr(cosim, name).__doc__ or "").strip()
+
+
+def test_another_name_is_refused_with_the_valid_ones() -> None:
+    """A misspelt name is an AttributeError that lists what there is."""
+    with pytest.raises(AttributeError, match=r"no attribute 'Epsiode'.*Episode"):
+        cosim.Epsiode  # noqa: B018  the access is the test
+
+
+def test_the_readme_shows_the_examples_as_they_are() -> None:
+    """Each script in `tests/examples` stands in the README, word for word."""
+    readme = (ROOT / "README.md").read_text()
+    for path in sorted(EXAMPLES.glob("*.py")):
+        assert f"```python\n{path.read_text()}```" in readme, path.name
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
+def test_the_examples_run_as_written(path: Path, tmp_path: Path) -> None:
+    """A script of the README ends well and prints what it promises."""
+    told = subprocess.run([sys.executable, str(path)], capture_output=True, text=True, check=False, cwd=tmp_path)
+    assert told.returncode == 0, told.stderr
+    assert re.search(r"obstructing-001", told.stdout)
+
+
+@pytest.mark.parametrize("engine", ["SumoCrowd(", "BulletWorld("])
+def test_engines_are_made_in_one_file(engine: str) -> None:
+    """One wiring: an engine's class is called in one file of the product, and defined in another."""
+    files = [path for top in PRODUCT for path in (ROOT / top).rglob("*.py")]
+    calls = [str(p.relative_to(ROOT)) for p in files if re.search(rf"(?<!class )\b{re.escape(engine)}", p.read_text())]
+    assert calls == ["scenarios/execution/wiring.py"]

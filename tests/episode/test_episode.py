@@ -1,0 +1,91 @@
+"""Episode: held, driven period by period, and refused in words when it is used out of turn."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import EngineError, PolicyError, UsageError
+from cosim.core.state import Command
+from cosim.episode.ports import CameraSpec, Manifest
+from cosim.spec.scenario import Scenario
+from scenarios.checks import small_scenario
+from scenarios.execution.episode import Episode
+from scenarios.execution.run import run_episode
+
+pytestmark = pytest.mark.engine
+
+SEEING = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(32, 24))
+AHEAD = Command(0.8, 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """Two seconds of a long way in a small city."""
+    return msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
+
+
+class Ahead:
+    """Drives straight on."""
+
+    manifest = SEEING
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: object) -> Command:
+        return AHEAD
+
+
+def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario) -> None:
+    """reset and advance until it is over: eight observations of four a second, then the record of the same run."""
+    times = []
+    with Episode(scenario, SEEING) as episode:
+        observation = episode.reset()
+        while not episode.over:
+            times.append(observation.time_s)
+            assert observation.rgb is not None and observation.rgb.shape == (24, 32, 3)
+            assert observation.privileged is None
+            observation = episode.advance(AHEAD)
+        record, log = episode.result()
+    assert times == [0.25 * k for k in range(8)]
+    assert (record.ended, record.ticks, len(log), observation.time_s) == ("timeout", 40, 40, 2.0)
+    assert episode.result()[0] is record
+    assert run_episode(scenario, Ahead()).record.state_hash == record.state_hash
+
+
+def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenario) -> None:
+    """until_tick ends a period early; the next one ends where it would have ended."""
+    with Episode(scenario, SEEING) as episode:
+        episode.reset()
+        assert episode.advance(AHEAD, until_tick=3).tick == 3
+        assert episode.advance(AHEAD).tick == 5
+
+
+def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> None:
+    """Before entering, before reset, twice begun, an answer that is none, after the end, after close: each in words."""
+    episode = Episode(scenario, SEEING)
+    with pytest.raises(UsageError, match="has not been entered: use it in a `with` block"):
+        episode.reset()
+    with episode:
+        with pytest.raises(UsageError, match=r"has not begun: call reset\(\) first"):
+            episode.advance(AHEAD)
+        episode.reset()
+        with pytest.raises(UsageError, match=r"has begun: .* make another Episode"):
+            episode.reset()
+        with pytest.raises(UsageError, match=r"is not over: advance\(\) it until"):
+            episode.result()
+        with pytest.raises(PolicyError, match="policy 'seeing' answered None"):
+            episode.advance(None)
+        with pytest.raises(EngineError, match="already running in this process"), Episode(scenario, SEEING):
+            pass
+        while not episode.over:
+            episode.advance(np.array([[0.2, 0.0]]))
+        with pytest.raises(UsageError, match=r"is over \(timeout\): ask for its result\(\)"):
+            episode.advance(AHEAD)
+    with pytest.raises(UsageError, match="is closed: make another"):
+        episode.advance(AHEAD)
+    with pytest.raises(UsageError, match="was used before"), episode:
+        pass
+    assert episode.result()[0].status == "done"
