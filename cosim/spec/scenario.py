@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -193,7 +194,7 @@ class Light(Ranged, frozen=True, kw_only=True, omit_defaults=True):
             yield f"light hdri must be a Radiance .hdr file, not {shown(self.hdri)}"
 
 
-class Scenario(Ranged, frozen=True, kw_only=True):
+class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
 
     id: Annotated[str, FOLDER]
@@ -251,8 +252,9 @@ class Scenario(Ranged, frozen=True, kw_only=True):
     def start_pose(self) -> Pose:
         return Pose(*self.start)
 
-    @property
+    @cached_property
     def route_line(self) -> Polyline:
+        """The reference route by arc length; made once."""
         return Polyline(self.route)
 
 
