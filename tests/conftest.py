@@ -37,7 +37,11 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them."""
+    """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them.
+
+    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it ignored.
+    """
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     made_by = hashlib.sha256(f"{version('eclipse-sumo')} {version('numpy')}".encode())
     for source in sorted((ROOT / "sumo_nets").rglob("*.py")):
         made_by.update(source.read_bytes())
