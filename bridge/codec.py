@@ -8,7 +8,7 @@ import msgspec
 
 from cosim.core.errors import EngineError
 
-T = TypeVar("T", bound=msgspec.Struct)
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 _encoder = msgspec.msgpack.Encoder()
 
@@ -18,7 +18,7 @@ def encode(message: msgspec.Struct) -> bytes:
     return _encoder.encode(message)
 
 
-def decode(payload: bytes, kind: type[T]) -> T:
+def decode(payload: bytes, kind: type[_T]) -> _T:
     """The message of type `kind` in `payload`. Raises EngineError when it is anything else."""
     try:
         return msgspec.msgpack.decode(payload, type=kind)

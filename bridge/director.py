@@ -29,7 +29,7 @@ NOTICE_S = 2.0
 LONGEST_REASON = 500
 """Letters: what a broken director says may be of any length."""
 
-T = TypeVar("T", bound=msgspec.Struct)
+_T = TypeVar("_T", bound=msgspec.Struct)
 
 
 class Signed(msgspec.Struct, frozen=True):
@@ -44,7 +44,7 @@ def signed(message: msgspec.Struct, by: str) -> bytes:
     return encode(Signed(by, msgspec.Raw(encode(message))))
 
 
-def opened(payload: bytes, kind: type[T], by: str) -> T:
+def opened(payload: bytes, kind: type[_T], by: str) -> _T:
     """The message in `payload`. Raises EngineError when it is none, or its sender's behaviours are others than `by`."""
     envelope = decode(payload, Signed)
     if envelope.by != by:

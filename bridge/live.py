@@ -26,12 +26,12 @@ def serve_injections(session: Session, key: str, offer: Offer) -> None:
     """Take injections in as JSON or MessagePack, and answer in the same. Whatever is wrong becomes a refusal."""
 
     def answer(payload: bytes) -> bytes:
-        return encoded(taken(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
+        return _encoded(answer_to(payload, offer), as_json=payload[:1] in _JSON_BEGINS)
 
     session.serve(key, answer)
 
 
-def taken(payload: bytes, offer: Offer) -> Ack:
+def answer_to(payload: bytes, offer: Offer) -> Ack:
     """What becomes of a message."""
     if len(payload) > LARGEST_B:
         return Ack(id="", status="refused", reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}")
@@ -43,11 +43,11 @@ def taken(payload: bytes, offer: Offer) -> Ack:
         return Ack(id="", status="refused", reason=f"{error}{unknown}")
 
 
-def encoded(ack: Ack, *, as_json: bool) -> bytes:
+def _encoded(ack: Ack, *, as_json: bool) -> bytes:
     return msgspec.json.encode(ack) if as_json else msgspec.msgpack.encode(ack)
 
 
-def inject(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
+def send_injection(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
     """Send an injection (JSON) and wait for its acknowledgement.
 
     Raises EngineError when the other side answers something else, TimeoutError when nobody answers.

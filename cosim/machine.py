@@ -85,7 +85,7 @@ def refusal(machine: Machine | None = None) -> str:
     return f"this machine lacks {_listed(lacking)}. {_remedy(wanted)}"
 
 
-def main(words: list[str] | None = None, machine: Machine | None = None) -> int:
+def check_machine(words: list[str] | None = None, machine: Machine | None = None) -> int:
     """Check the machine before anything is set up; 0 if all is there, else 3, with the one command that mends it."""
     options = argparse.ArgumentParser(description="Check what this machine lacks.")
     options.add_argument("--python", default=sys.executable, help="The Python 3.11 that will be used.")
@@ -132,4 +132,4 @@ def _say(words: str) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(check_machine())

@@ -53,7 +53,7 @@ def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     return replace(whole, scenarios=scenarios, version=version)
 
 
-def chosen(
+def scenarios_chosen(
     whole: Suite, ids: Sequence[str] = (), episodes: int | None = None, kinds: Sequence[str] = ()
 ) -> tuple[Scenario, ...]:
     """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.

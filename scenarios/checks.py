@@ -17,14 +17,14 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.policies.baselines import Straight
 from cosim.spec.events import EventQuery
 from cosim.spec.scenario import City, CrowdSpec, Scenario
-from physics.cameras.choice import chosen, renderer_of
-from scenarios.builders.long_horizon import build
+from physics.cameras.choice import camera_of_choice, renderer_of
+from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.execution.directing import directed
 from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
 from sumo_nets.city.store import cache_folder
 
-SMALL = City(seed=1, size_m=500.0)
+_SMALL = City(seed=1, size_m=500.0)
 OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
@@ -49,7 +49,7 @@ def cache() -> str:
 
 
 def city() -> str:
-    net, street_map = place(SMALL)
+    net, street_map = place(_SMALL)
     return f"netconvert built {Path(net).name}: {len(street_map.strips)} strips, {len(street_map.corners)} corners"
 
 
@@ -66,7 +66,7 @@ def bridge() -> str:
 def cameras() -> str:
     """Which camera `--camera auto` takes, and why."""
     try:
-        return f"gl works and is taken ({renderer_of(chosen('gl'))}); so does bullet"
+        return f"gl works and is taken ({renderer_of(camera_of_choice('gl'))}); so does bullet"
     except EngineError as error:
         return f"bullet works and is taken; gl does not: {error}"
 
@@ -85,8 +85,8 @@ def frame() -> str:
 
 def small_scenario() -> Scenario:
     """A long-horizon scenario in a small city with a small crowd."""
-    _, street_map = place(SMALL)
-    scenario = build(SMALL, street_map, WalkGraph(street_map), 0, "doctor")
+    _, street_map = place(_SMALL)
+    scenario = build_long_horizon(_SMALL, street_map, WalkGraph(street_map), 0, "doctor")
     return msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=10, radius_m=50.0, vehicles=4))
 
 

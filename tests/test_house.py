@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import configparser
 import re
 import subprocess
@@ -88,3 +89,28 @@ def test_no_folder_is_flat_and_endless() -> None:
     for room in ROOMS:
         for folder in (ROOT / room, *(path for path in (ROOT / room).rglob("*") if path.is_dir())):
             assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 20, folder
+
+
+def test_no_public_name_stands_twice() -> None:
+    """What a module defines without an underscore is defined in no other module."""
+    where: dict[str, list[str]] = {}
+    for room in ROOMS:
+        for path in sorted((ROOT / room).rglob("*.py")):
+            for name in _public_names(ast.parse(path.read_text())):
+                where.setdefault(name, []).append(path.relative_to(ROOT).as_posix())
+    entry = {"main": ["cosim/__main__.py", "cosim/cli/app.py"]}
+    assert {name: paths for name, paths in where.items() if len(paths) > 1} == entry
+
+
+def _public_names(module: ast.Module) -> set[str]:
+    """Names that the module binds at its top: classes, functions, constants; imports are another module's."""
+    names: set[str] = set()
+    for node in module.body:
+        match node:
+            case ast.ClassDef(name=name) | ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
+                names.add(name)
+            case ast.Assign(targets=targets):
+                names |= {part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)}
+            case ast.AnnAssign(target=ast.Name(id=name)):
+                names.add(name)
+    return {name for name in names if not name.startswith("_")}

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 
 from cosim.cli.bench import bench
 from cosim.cli.board import Board
 from cosim.cli.city import city_app
+from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
 from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
@@ -35,16 +35,14 @@ app = typer.Typer(
     epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`",
 )
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
-out = Console()
-err = Console(stderr=True)
 
 
 def say_versions(asked: bool) -> None:
     """Print the versions and end, if asked for."""
     if asked:
-        from cosim.core.versions import in_words
+        from cosim.core.versions import versions_in_words
 
-        typer.echo(in_words())
+        typer.echo(versions_in_words())
         raise typer.Exit
 
 
@@ -58,6 +56,7 @@ def common(
 
 
 @app.command(
+    "run",
     epilog="Examples:  \n"
     "`cosim run long-horizon --policy route --episodes 2`  \n"
     "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
@@ -66,9 +65,9 @@ def common(
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
-    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`"
+    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`",
 )
-def run(
+def run_command(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
@@ -118,7 +117,7 @@ def run(
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
     from scenarios.builders.fits import LOOKING, check_places
-    from scenarios.catalog import chosen, load_suite, with_crowd
+    from scenarios.catalog import load_suite, scenarios_chosen, with_crowd
     from scenarios.execution.asked import Patience
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
@@ -135,7 +134,7 @@ def run(
     else:
         whole = load_suite(suite)
     whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
-    picked = chosen(whole, scenario or (), episodes, event or ())
+    picked = scenarios_chosen(whole, scenario or (), episodes, event or ())
     loaded = load_policy(policy)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"

@@ -5,15 +5,14 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
+from cosim.cli.consoles import out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
 from cosim.cli.progress import doing
 from cosim.core.errors import unknown
 
 NONE = ("none: see below", "")
-out = Console()
 
 
 def bench(
@@ -52,11 +51,11 @@ def bench(
         bench_cameras(rounds)
         return
     from scenarios.bench import street as bench_street
-    from scenarios.bench.speed import PARTS, measure, spread
+    from scenarios.bench.speed import TIMED_PARTS, spread, time_episodes
 
     with doing("measuring") as tell:
-        report = measure(rounds, lambda words: tell(f"measuring: {words}"))
-        streets = bench_street.measure(rounds, lambda words: tell(f"measuring: {words}"))
+        report = time_episodes(rounds, lambda words: tell(f"measuring: {words}"))
+        streets = bench_street.time_street(rounds, lambda words: tell(f"measuring: {words}"))
     table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
     rows: list[tuple[str, list[float], str]] = [
         ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
@@ -70,7 +69,7 @@ def bench(
         table.add_row(name, *spread(values), target)
     out.print(table)
     parts = Table("part", "ms per simulated second", "spread", "share inside the engine")
-    for part in PARTS:
+    for part in TIMED_PARTS:
         inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
         parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
     out.print(parts)
@@ -92,14 +91,14 @@ def bench(
 
 def bench_cameras(rounds: int) -> None:
     """Measure the cameras in one busy street and print frames a second, targets and ratios."""
-    from physics.cameras.choice import chosen, renderer_of
-    from scenarios.bench.cameras import FIGURES, PERSONS, RATIOS, SIZE, measure
+    from physics.cameras.choice import camera_of_choice, renderer_of
+    from scenarios.bench.cameras import FIGURES, PERSONS, RATIOS, SIZE, time_cameras
     from scenarios.bench.speed import spread
 
-    drawn_by = renderer_of(chosen("auto"))
+    drawn_by = renderer_of(camera_of_choice("auto"))
     on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by
     with doing("measuring") as tell:
-        found = measure(rounds, lambda words: tell(f"measuring: {words}"))
+        found = time_cameras(rounds, lambda words: tell(f"measuring: {words}"))
     head = f"busy street, {PERSONS} people in view, {SIZE[0]}x{SIZE[1]}"
     table = Table(head, "frames/s", "spread", "target")
     for figure in FIGURES:

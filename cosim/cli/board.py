@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 
+from cosim.cli.consoles import err
 from cosim.core.telling import duration
 
 if TYPE_CHECKING:
     from cosim.spec.scenario import Scenario
 
-err = Console(stderr=True)
 SETUP_M = 30.0
 """Starting an episode takes about as long as so many metres of its route."""
 ALONE = 0.74
 """Of an episode that is compared with its street without the robot, the share of the episode itself."""
-SURE, SURE_S = 0.02, 5.0
+_SURE, _SURE_S = 0.02, 5.0
 """Of a smaller share of a run, or after less time, nothing is concluded."""
 BAR = 12
 """Columns of a bar: the display fits a terminal of 80."""
@@ -46,7 +46,7 @@ class Left:
 
     def seconds(self, since_s: float) -> float | None:
         """How long the rest takes, judged by the `since_s` seconds that the run took so far; None: too early to say."""
-        if self.share < SURE or since_s < SURE_S:
+        if self.share < _SURE or since_s < _SURE_S:
             return None
         return since_s * (1.0 - self.share) / self.share
 

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
+from cosim.cli.consoles import err, out
 from cosim.cli.progress import doing
 from cosim.core.box import box_of
 from cosim.core.errors import SOME_CRASHED
@@ -23,14 +24,12 @@ if TYPE_CHECKING:
     from scenarios.bench.survey import Survey
 
 city_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Generated cities, from a seed.")
-out = Console()
-err = Console(stderr=True)
 
 Seed = Annotated[int, typer.Option(min=0, help="Every seed is another city.")]
-Size = Annotated[float, typer.Option(help="Side of its square in metres, 200 to 4000.")]
-Style = Annotated[str, typer.Option(help="mixed, downtown or suburb.")]
+_Size = Annotated[float, typer.Option(help="Side of its square in metres, 200 to 4000.")]
+_Style = Annotated[str, typer.Option(help="mixed, downtown or suburb.")]
 
-FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
+_FIGURES: tuple[tuple[str, Callable[[Survey], float], str], ...] = (
     ("straight", lambda s: s.census.blocks["straight"], "d"),
     ("curve", lambda s: s.census.blocks["curve"], "d"),
     ("S", lambda s: s.census.blocks["s_bend"], "d"),
@@ -65,8 +64,8 @@ MEANING = (
 def make(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="A folder, made for it.")],
     seed: Seed,
-    size: Size = 2000.0,
-    style: Style = "mixed",
+    size: _Size = 2000.0,
+    style: _Style = "mixed",
 ) -> None:
     """Make a city: a folder with its street net, and what it was made from. Equal to the byte when made again."""
     from cosim.spec.scenario import City
@@ -81,8 +80,8 @@ def make(
 @city_app.command(epilog="Example:  \n`cosim city table --count 10 --jobs 2`")
 def table(
     count: Annotated[int, typer.Option(min=1, max=100, help="How many of the shipped cities.")] = 100,
-    size: Size = 2000.0,
-    style: Style = "mixed",
+    size: _Size = 2000.0,
+    style: _Style = "mixed",
     jobs: Annotated[int, typer.Option(min=1, help="Processes, about 0.3 GiB each.")] = 1,
 ) -> None:
     """Count what the shipped cities are made of, furniture included, and check them. Exit code 1: one breaks a
@@ -103,13 +102,14 @@ def table(
 
 
 @city_app.command(
-    epilog="Examples:  \n`cosim city draw 7 -o city.png`  \n`cosim city draw 7 --zoom 900,900,1100,1100 -o block.png`"
+    "draw",
+    epilog="Examples:  \n`cosim city draw 7 -o city.png`  \n`cosim city draw 7 --zoom 900,900,1100,1100 -o block.png`",
 )
-def draw(
+def draw_city(
     seed: Annotated[int, typer.Argument(min=0, help="The city's seed.")],
     picture: Annotated[Path, typer.Option("-o", "--output", help="Where to write the picture, a PNG.")],
-    size: Size = 2000.0,
-    style: Style = "mixed",
+    size: _Size = 2000.0,
+    style: _Style = "mixed",
     zoom: Annotated[str | None, typer.Option(help="Part of it: x0,y0,x1,y1 in metres.")] = None,
 ) -> None:
     """Draw a city from above."""
@@ -129,15 +129,15 @@ def draw(
 
 def print_cities(found: Sequence[Survey]) -> None:
     """A row per city, the spans of all, widths of the zones, and whatever is wrong."""
-    heads = [Column(head, justify="right", no_wrap=True) for head, _, _ in FIGURES]
+    heads = [Column(head, justify="right", no_wrap=True) for head, _, _ in _FIGURES]
     shown = Table(Column("seed", no_wrap=True), *heads, box=box.SIMPLE_HEAD, padding=(0, 0, 0, 1))
     for one in found:
-        shown.add_row(str(one.seed), *(format(value(one), form) for _, value, form in FIGURES))
+        shown.add_row(str(one.seed), *(format(value(one), form) for _, value, form in _FIGURES))
     shown.add_section()
     for name, pick in (("min", min), ("median", statistics.median), ("max", max)):
         cells = [
             format(round(x) if form == "d" else x, form)
-            for _, value, form in FIGURES
+            for _, value, form in _FIGURES
             for x in [pick([value(one) for one in found])]
         ]
         shown.add_row(name, *cells)

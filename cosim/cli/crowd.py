@@ -7,12 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
 
+from cosim.cli.consoles import out
 from cosim.cli.progress import doing
-
-out = Console()
 
 LIGHTS = (
     ("persons entered at red", "persons entered signalised crossings", "0"),
@@ -121,7 +119,7 @@ def compare_one(
     episode: Annotated[str, typer.Argument(help="One of its episodes.")],
 ) -> None:
     """Replay an episode, simulate its street again without the robot, and print whom the robot delayed by how much."""
-    from cosim.judge.delay import NEAR_M
+    from cosim.judge.delay import DELAY_NEAR_M
     from scenarios.execution.replay import check, compared, recorded
 
     with doing(f"reading {episode}") as tell:
@@ -134,6 +132,6 @@ def compare_one(
         table.add_row(name, *near, *everybody, str(delay.unmatched))
     out.print(table)
     out.print(
-        f"delay: how much later than without the robot, summed; near: came within {NEAR_M:g} m of it; far from it the "
-        "two streets differ by chance; not comparable: not the same in both"
+        f"delay: how much later than without the robot, summed; near: came within {DELAY_NEAR_M:g} m of it; far from "
+        "it the two streets differ by chance; not comparable: not the same in both"
     )

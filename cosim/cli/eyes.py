@@ -7,18 +7,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
-from rich.console import Console
 
+from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
 from cosim.cli.progress import doing
 from cosim.core.errors import MachineError, UsageError, unknown
 
 if TYPE_CHECKING:
-    from scenarios.viewing.look import View
+    from scenarios.viewing.look import Viewpoint
 
 PICTURES = (".png", ".jpg", ".jpeg")
-out = Console()
-err = Console(stderr=True)
 
 Choice = Literal["auto", "gl", "bullet", "bullet-egl"]
 CAMERA_HELP = (
@@ -30,9 +28,9 @@ RESIDENTS_HELP = "In place of the scenario's: so many people who sit on benches,
 
 def camera_here(choice: Choice) -> Literal["gl", "bullet", "bullet-egl"]:
     """The camera that a choice comes to on this machine; says so where auto is not gl. Raises EngineError."""
-    from physics.cameras.choice import chosen
+    from physics.cameras.choice import camera_of_choice
 
-    name = chosen(choice)
+    name = camera_of_choice(choice)
     if choice == "auto" and name == "bullet":
         err.print("No OpenGL here: the bullet camera draws the pictures (`cosim doctor` says why).")
     return name
@@ -55,17 +53,17 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import chosen, holding, load_suite, with_crowd
-    from scenarios.viewing.look import look
+    from scenarios.catalog import holding, load_suite, scenarios_chosen, with_crowd
+    from scenarios.viewing.look import look_at
 
     picked = view_of(view)
     pixels = size_of(size)
     check_picture(output)
     found = holding(scenario) if suite is None else load_suite(suite)
     whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
-    (one,) = chosen(whole, [scenario])
+    (one,) = scenarios_chosen(whole, [scenario])
     with doing("choosing the camera") as tell:
-        image, time_s = look(one, policy, at, picked, pixels, camera_here(camera), tell)
+        image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)
     save(image, output)
     out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
 
@@ -84,20 +82,20 @@ def film(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Film an episode of a run: from behind the robot or above it, with what it sees, the map, events and failures."""
-    from scenarios.viewing.film import Cut, film
+    from scenarios.viewing.film import Cut, make_film
 
     picked = view_of(view)
     until_s = math.inf if end is None else end
     with doing("choosing the camera") as tell:
         cut = Cut(start, until_s, size_of(size), speed, camera_here(camera), picked)
-        to_s = film(folder, episode, output, cut, tell)
+        to_s = make_film(folder, episode, output, cut, tell)
     same = (
         "the state hash is the record's" if to_s == math.inf else f"of its first {to_s:g} s every tick is as recorded"
     )
     out.print(f"Film: {output} ({same})", soft_wrap=True, highlight=False)
 
 
-def view_of(name: str) -> View:
+def view_of(name: str) -> Viewpoint:
     """The view called so. Raises UsageError with the valid names."""
     from scenarios.viewing.look import VIEWS
 

@@ -11,16 +11,14 @@ from queue import Empty, SimpleQueue
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 
+from cosim.cli.consoles import err, out
 from cosim.cli.progress import doing
 from cosim.core.errors import INTERRUPTED, WRONG_USE, CosimError, EngineError, UsageError, unknown
 
 if TYPE_CHECKING:
     from bridge.session import Session
 
-out = Console()
-err = Console(stderr=True)
 
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
@@ -44,7 +42,7 @@ def inject(
     wait: Wait = 0.0,
 ) -> None:
     """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 2: refused."""
-    from bridge.live import inject as send
+    from bridge.live import send_injection as send
 
     payload = _payload(message)
     session, below = found(connect, env, wait)

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 from rich import box
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.cli.consoles import out
 from cosim.cli.progress import doing
 from cosim.core.box import box_of
 from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from sumo_nets.maps.mapstore import About
 
 map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Cities of the real world: SUMO and OSM.")
-out = Console()
 
 
 @map_app.command(
@@ -61,12 +60,13 @@ def import_(
 
 
 @map_app.command(
+    "check",
     epilog="Examples:  \n"
     "`cosim map check hamburg -o hamburg.png`  \n"
     "`cosim map check hamburg --zoom 900,700,1200,1000 -o junction.png`  \n"
-    "`cosim map check sumo-fkk-in --json`"
+    "`cosim map check sumo-fkk-in --json`",
 )
-def check(
+def report_map_check(
     place: Annotated[str, typer.Argument(metavar="MAP", help="A map, a folder of a city or map, a .net.xml(.gz).")],
     picture: Annotated[Path | None, typer.Option("-o", "--output", help="Write a picture of it, a PNG.")] = None,
     zoom: Annotated[str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")] = None,
@@ -95,9 +95,10 @@ def check(
 
 
 @map_app.command(
-    epilog="Examples:  \n`cosim map endure sumo-drt`  \n`cosim map endure sumo-drt sumo-fkk-in --minutes 30 --seed 1`"
+    "endure",
+    epilog="Examples:  \n`cosim map endure sumo-drt`  \n`cosim map endure sumo-drt sumo-fkk-in --minutes 30 --seed 1`",
 )
-def endure(
+def endure_map(
     maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps, folders of cities or maps, nets.")],
     minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
     seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,

@@ -9,10 +9,10 @@ from contextlib import contextmanager
 from rich.console import Console
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
+from cosim.cli.consoles import err
 from cosim.core.telling import Tell, duration
 
-err = Console(stderr=True)
-SURE, SURE_S = 0.03, 3.0
+_SURE, _SURE_S = 0.03, 3.0
 """Of less of a stage than this share, or after less time, nothing is concluded."""
 
 
@@ -33,7 +33,7 @@ def doing(first: str, console: Console = err) -> Iterator[Tell]:
                 nonlocal now, began
                 if stage != now:
                     now, began = stage, time.monotonic()
-                bars.update(task, description=in_words(stage, share, time.monotonic() - began))
+                bars.update(task, description=stage_in_words(stage, share, time.monotonic() - began))
 
             yield move
         return
@@ -49,11 +49,11 @@ def doing(first: str, console: Console = err) -> Iterator[Tell]:
     yield tell
 
 
-def in_words(stage: str, share: float | None, since_s: float) -> str:
+def stage_in_words(stage: str, share: float | None, since_s: float) -> str:
     """A stage, how much of it is done, and how long the rest takes, judged by the `since_s` seconds it took so far."""
     if share is None:
         return stage
     words = f"{stage}: {100.0 * share:.0f} %"
-    if share < SURE or since_s < SURE_S:
+    if share < _SURE or since_s < _SURE_S:
         return words
     return f"{words}, about {duration(since_s * (1.0 - share) / share)} left"

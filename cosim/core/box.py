@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from cosim.core.errors import UsageError
 
-Box = tuple[float, float, float, float]
+_Box = tuple[float, float, float, float]
 
 
-def box_of(option: str, words: str, sides: str = "west,south,east,north") -> Box:
+def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Box:
     """The four numbers in the words of an option. Raises UsageError naming the option and its `sides`."""
     try:
         x0, y0, x1, y1 = (float(word) for word in words.split(","))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 
 @dataclass(slots=True)
-class Rows:
+class RowLookup:
     """Remembers the names of the last moment. Mostly they are the same: then the rows of that moment are told again."""
 
     _ids: tuple[str, ...] = ()

@@ -23,7 +23,7 @@ Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"
 phone, sitting on a seat behind the place where it is."""
 
 
-def frozen(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
+def write_protected(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
     """A write-protected copy of `array`."""
     copy = np.array(array, dtype=dtype)
     if shape is not None:
@@ -79,12 +79,12 @@ class People:
         n = len(ids)
         return cls(
             ids,
-            frozen(xy, shape=(n, 2)),
-            frozen(heading, shape=(n,)),
-            frozen(speed, shape=(n,)),
+            write_protected(xy, shape=(n, 2)),
+            write_protected(heading, shape=(n,)),
+            write_protected(speed, shape=(n,)),
             doing,
-            frozen(np.zeros(n) if strides is None else strides, shape=(n,)),
-            frozen(speed if pace is None else pace, shape=(n,)),
+            write_protected(np.zeros(n) if strides is None else strides, shape=(n,)),
+            write_protected(speed if pace is None else pace, shape=(n,)),
         )
 
     def only(self, rows: NDArray[np.intp]) -> People:
@@ -118,10 +118,10 @@ class Vehicles:
         n = len(ids)
         return cls(
             ids,
-            frozen(xy, shape=(n, 2)),
-            frozen(heading, shape=(n,)),
-            frozen(speed, shape=(n,)),
-            frozen(size, shape=(n, 2)),
+            write_protected(xy, shape=(n, 2)),
+            write_protected(heading, shape=(n,)),
+            write_protected(speed, shape=(n,)),
+            write_protected(size, shape=(n, 2)),
         )
 
     def __len__(self) -> int:

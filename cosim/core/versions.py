@@ -14,7 +14,7 @@ import platform
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
 
-PACKAGES = (
+RECORDED_PACKAGES = (
     "sidewalk-cosim",
     "libsumo",
     "eclipse-sumo",
@@ -38,11 +38,11 @@ def versions() -> dict[str, str]:
     """Version of each package by distribution name, of `geos` as shapely loaded it, and of the C library `glibc`."""
     import shapely
 
-    found = {package: version(package) for package in PACKAGES}
+    found = {package: version(package) for package in RECORDED_PACKAGES}
     return {**found, "geos": shapely.geos_version_string, "glibc": platform.libc_ver()[1]}
 
 
-def in_words() -> str:
+def versions_in_words() -> str:
     """Versions of the project, Python and the engines, for humans; nothing is imported to find them."""
     engines = ", ".join(f"{name} {_installed(package)}" for name, package in ENGINES.items())
     return f"cosim {_installed('sidewalk-cosim')}, Python {platform.python_version()}\n{engines}"

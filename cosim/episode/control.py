@@ -16,7 +16,7 @@ from cosim.core.state import Command
 EPS_M = 1e-8
 REAL_KINDS = "iuf"
 """The kinds of numpy that are real numbers: integers, unsigned, floating."""
-MOST_SHOWN = 80
+_MOST_SHOWN = 80
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +92,11 @@ def _number(value: object) -> float:
 
 def _shown(value: object) -> str:
     """An answer as it is told: its repr if that is short and can be had, else its kind."""
-    if isinstance(value, int) and value.bit_length() > MOST_SHOWN:
+    if isinstance(value, int) and value.bit_length() > _MOST_SHOWN:
         return f"an integer of {value.bit_length()} bits"
     try:
         text = repr(value)
     except Exception:  # noqa: BLE001  a repr may do anything
         return f"a {type(value).__name__}"
-    tells = len(text) <= MOST_SHOWN and text.isprintable() and " at 0x" not in text  # an address is another every time
+    tells = len(text) <= _MOST_SHOWN and text.isprintable() and " at 0x" not in text  # an address is another every time
     return text if tells else f"a {type(value).__name__}"

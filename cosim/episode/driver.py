@@ -21,7 +21,7 @@ from cosim.core.state import Command, People, RobotState, Signal, Vehicles
 from cosim.episode.control import Limits, command_of
 from cosim.episode.ports import Manifest, Observation, Policy, Privileged
 
-Doing = Literal["loading", "reset", "first act", "act"]
+PolicyCall = Literal["loading", "reset", "first act", "act"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
 
 MOST_SAID = 500
@@ -31,7 +31,7 @@ MOST_SAID = 500
 class Timer(Protocol):
     """Is told when a policy is asked and when it has answered."""
 
-    def starts(self, doing: Doing, tick: int) -> None: ...
+    def starts(self, doing: PolicyCall, tick: int) -> None: ...
 
     def stops(self) -> None: ...
 
@@ -39,7 +39,7 @@ class Timer(Protocol):
 class Untimed:
     """A timer that does not care."""
 
-    def starts(self, doing: Doing, tick: int) -> None:
+    def starts(self, doing: PolicyCall, tick: int) -> None:
         """Nothing to start."""
 
     def stops(self) -> None:
@@ -89,7 +89,7 @@ class Driver:
         return command
 
     @contextmanager
-    def _asked(self, doing: Doing, tick: int) -> Iterator[None]:
+    def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
         """The policy at work: timed, and whatever it raises is a PolicyError."""
         process = os.getpid()
         self._timer.starts(doing, tick)
@@ -133,7 +133,7 @@ class Driver:
         )
 
 
-def when(doing: Doing, tick: int) -> str:
+def when(doing: PolicyCall, tick: int) -> str:
     """What a policy was doing, in words: "reset", or "act at 3.2 s"."""
     return f"act at {Clock().time_s(tick):.2f} s" if doing.endswith("act") else doing
 

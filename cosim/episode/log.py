@@ -48,7 +48,7 @@ class Log:
         return len(self.pose)
 
     def row(self, tick: int) -> Floats:
-        """(14,) the values of a tick, in the order of `cosim.records.record.row_of`."""
+        """(14,) the values of a tick, in the order of `cosim.records.record.log_row`."""
         columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
         more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
         return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)

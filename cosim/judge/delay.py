@@ -19,10 +19,10 @@ import numpy as np
 from cosim.core.geometry import Floats
 from cosim.core.state import People, Vehicles
 
-NEAR_M: Final = 10.0
+DELAY_NEAR_M: Final = 10.0
 MOVING_MPS: Final = 0.1
-SAME_PLACE_M: Final = 0.5
-SLACK_M: Final = 0.5
+_SAME_PLACE_M: Final = 0.5
+_SLACK_M: Final = 0.5
 
 
 class Delay(NamedTuple):
@@ -74,7 +74,7 @@ def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Trac
     for name in sorted(present.began):
         mine, other = present.way(name), absent.way(name)
         first = present.began[name]
-        same = first == absent.began.get(name) and np.hypot(*(mine[0] - other[0])) < SAME_PLACE_M
+        same = first == absent.began.get(name) and np.hypot(*(mine[0] - other[0])) < _SAME_PLACE_M
         if not same:
             unmatched += 1
             continue
@@ -84,7 +84,7 @@ def delay_of(robot: Sequence[tuple[float, float]], present: Tracks, absent: Trac
             continue
         late_s = _late(mine, other) * tick_s
         gap = mine - at[first : first + shared]
-        is_near = bool((np.hypot(gap[:, 0], gap[:, 1]) < NEAR_M).any())
+        is_near = bool((np.hypot(gap[:, 0], gap[:, 1]) < DELAY_NEAR_M).any())
         delay_s, compared = delay_s + late_s, compared + 1
         near_s, near = near_s + late_s * is_near, near + is_near
     return Delay(delay_s, near_s, compared, near, unmatched)
@@ -102,7 +102,7 @@ def _since(point: Floats, way: Floats) -> tuple[int, float]:
     away = np.hypot(*(way - point).T)
     nearest = float(away.min())
     # A circle that cuts SLACK_M off a straight way which passes the point at a distance.
-    last = np.flatnonzero(away <= math.hypot(nearest, SLACK_M))[-1]
+    last = np.flatnonzero(away <= math.hypot(nearest, _SLACK_M))[-1]
     return len(way) - 1 - int(last), nearest
 
 

@@ -18,7 +18,7 @@ from cosim.records.record import TriggeredEvent
 from cosim.spec.events import Event, EventState, Walker
 from cosim.spec.scenario import Scenario
 
-SEEN_M: Final = 30.0
+_SEEN_M: Final = 30.0
 """Farther away nobody counts as seen."""
 HALF_VIEW_RAD: Final = math.radians(45.0)
 """Half the width of a view in which everybody must have been once; narrower than every camera of the field."""
@@ -79,7 +79,7 @@ def in_view(robot: Pose, walker: Walker) -> bool:
     """Whether somebody is before the robot, within HALF_VIEW_RAD of its heading and SEEN_M."""
     dx, dy = walker.x_m - robot.x_m, walker.y_m - robot.y_m
     off = wrap_angle(math.atan2(dy, dx) - robot.heading_rad)
-    return math.hypot(dx, dy) <= SEEN_M and abs(off) <= HALF_VIEW_RAD
+    return math.hypot(dx, dy) <= _SEEN_M and abs(off) <= HALF_VIEW_RAD
 
 
 def went_between(before: Floats, after: Floats, walkers: tuple[Walker, ...]) -> bool:

@@ -20,7 +20,7 @@ SCHEMA = 2
 """Raised whenever a definition changes; results of different schemas are not compared."""
 
 STALLED_MPS = 0.05
-PERSONAL_SPACE_M = 1.2
+_PERSONAL_SPACE_M = 1.2
 INTIMATE_SPACE_M = 0.45
 PROGRESS_WINDOW_S = 5.0
 PROGRESS_MIN_M = 0.1
@@ -29,7 +29,7 @@ RATE_NEEDS_M = 1.0
 
 
 @dataclass(frozen=True)
-class Episode:
+class EpisodeFacts:
     """What the metrics see of an episode. route_length_m: of the reference route, the geodesic walkable length.
     rules_broken: of events that were not passed as they should be."""
 
@@ -46,25 +46,25 @@ class Metric(NamedTuple):
 
     unit: str
     higher_is_better: bool | None
-    of: Callable[[Episode], float | None]
+    of: Callable[[EpisodeFacts], float | None]
 
 
-def goal_reached(episode: Episode) -> float:
+def goal_reached(episode: EpisodeFacts) -> float:
     """1 if the episode ended at the goal within its time limit, however many failures were counted."""
     return float(episode.ended == "goal")
 
 
-def success(episode: Episode) -> float:
+def success(episode: EpisodeFacts) -> float:
     """1 if the goal was reached, or the stop made that was asked for, in time, without a failure or a broken rule."""
     return float(episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken)
 
 
-def travelled_m(episode: Episode) -> float:
+def travelled_m(episode: EpisodeFacts) -> float:
     """Driven length: sum of displacements at the physics rate, reset jumps excluded."""
     return float(episode.log.travelled_m.sum())
 
 
-def progress_m(episode: Episode) -> float:
+def progress_m(episode: EpisodeFacts) -> float:
     """Arc length of the route gained by driving: growth of the furthest arc length, reset jumps excluded."""
     return progress_of(episode.log.route_s_m, episode.log.reset_s_m)
 
@@ -80,53 +80,53 @@ def progress_of(route_s_m: np.ndarray, reset_s_m: np.ndarray) -> float:
     return gained
 
 
-def route_completion(episode: Episode) -> float:
+def route_completion(episode: EpisodeFacts) -> float:
     """Progress / route length, in [0, 1]; 1 needs the goal, or the stop where that is asked for."""
     if episode.ended in ("goal", "stop") and not np.isfinite(episode.log.reset_s_m).any():
         return 1.0
     return min(progress_m(episode) / episode.route_length_m, 1.0)
 
 
-def spl(episode: Episode) -> float:
+def spl(episode: EpisodeFacts) -> float:
     """Success weighted by path length, S l / max(p, l) (Anderson et al.), l the geodesic walkable length."""
     return success(episode) * episode.route_length_m / max(travelled_m(episode), episode.route_length_m)
 
 
-def time_s(episode: Episode) -> float:
+def time_s(episode: EpisodeFacts) -> float:
     return len(episode.log) * episode.log.tick_s
 
 
-def velocity_mean_mps(episode: Episode) -> float | None:
+def velocity_mean_mps(episode: EpisodeFacts) -> float | None:
     """Metres travelled / simulated time, frozen time included."""
     return travelled_m(episode) / time_s(episode) if len(episode.log) else None
 
 
-def pedestrian_distance_min_m(episode: Episode) -> float | None:
+def pedestrian_distance_min_m(episode: EpisodeFacts) -> float | None:
     """Least centre distance to a person; absent if there never was one."""
     nearest = float(episode.log.person_m.min()) if len(episode.log) else np.inf
     return nearest if np.isfinite(nearest) else None
 
 
-def space_compliance(episode: Episode) -> float | None:
+def space_compliance(episode: EpisodeFacts) -> float | None:
     """Share of ticks with nobody within 0.45 m (centre distance); absent without people."""
     if pedestrian_distance_min_m(episode) is None:
         return None
     return float((episode.log.person_m > INTIMATE_SPACE_M).mean())
 
 
-def personal_space_violation(episode: Episode) -> float | None:
+def personal_space_violation(episode: EpisodeFacts) -> float | None:
     """Share of ticks with somebody nearer than 1.2 m (centre distance); absent without people."""
     if pedestrian_distance_min_m(episode) is None:
         return None
-    return float((episode.log.person_m < PERSONAL_SPACE_M).mean())
+    return float((episode.log.person_m < _PERSONAL_SPACE_M).mean())
 
 
-def stalled_time_s(episode: Episode) -> float:
+def stalled_time_s(episode: EpisodeFacts) -> float:
     """Time slower than 0.05 m/s."""
     return float((np.abs(episode.log.speed[:, 0]) < STALLED_MPS).sum() * episode.log.tick_s)
 
 
-def failure_to_progress(episode: Episode) -> float:
+def failure_to_progress(episode: EpisodeFacts) -> float:
     """Number of successive 5 s windows in which driving gained less than 0.1 m of arc length; jumps do not count."""
     window = round(PROGRESS_WINDOW_S / episode.log.tick_s)
     s_m, reset_s_m = episode.log.route_s_m, episode.log.reset_s_m
@@ -136,30 +136,30 @@ def failure_to_progress(episode: Episode) -> float:
     return float(sum(driven[i : i + window].sum() < PROGRESS_MIN_M for i in windows))
 
 
-def carriageway_time_s(episode: Episode) -> float:
+def carriageway_time_s(episode: EpisodeFacts) -> float:
     """Time with the base centre on a road outside the crossings, or on a crossing whose signal says stop."""
     return float(episode.log.on_carriageway.sum() * episode.log.tick_s)
 
 
-def vehicles_braked(episode: Episode) -> float:
+def vehicles_braked(episode: EpisodeFacts) -> float:
     """How often a vehicle had to slow down by more than 2 m/s2 for a robot without green (`cosim.judge.traffic`)."""
     return float(episode.log.vehicles_braked.sum())
 
 
-def count(kind: str) -> Callable[[Episode], float]:
+def count(kind: str) -> Callable[[EpisodeFacts], float]:
     """Number of failures of a kind; "" counts all."""
     return lambda episode: float(sum(kind in ("", failure.kind) for failure in episode.failures))
 
 
-def collisions_with(other_kind: str) -> Callable[[Episode], float]:
+def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
     """Number of collisions with a kind of thing."""
     return lambda episode: float(sum(f.kind == "collision" and f.other_kind == other_kind for f in episode.failures))
 
 
-def per_100m(kind: str, distance: Callable[[Episode], float]) -> Callable[[Episode], float | None]:
+def per_100m(kind: str, distance: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float | None]:
     """Failures of a kind per 100 m of a distance; absent below 1 m."""
 
-    def rate(episode: Episode) -> float | None:
+    def rate(episode: EpisodeFacts) -> float | None:
         metres = distance(episode)
         return 100.0 * count(kind)(episode) / metres if metres >= RATE_NEEDS_M else None
 
@@ -209,6 +209,6 @@ COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
 for: delay of those that came near the robot, summed, and how many they were. No part of any other episode."""
 
 
-def measure(episode: Episode) -> dict[str, float | None]:
+def every_metric(episode: EpisodeFacts) -> dict[str, float | None]:
     """Every metric of an episode."""
     return {name: metric.of(episode) for name, metric in METRICS.items()}

@@ -38,17 +38,17 @@ from cosim.spec.scenario import Scenario
 
 FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
-APART_M = 0.1
-APART_S = 1.0
+_APART_M = 0.1
+_APART_S = 1.0
 WAYPOINT_STEP_M = 5.0
 FREE_OF_PEOPLE_M = 1.0
 FREE_OF_VEHICLES_M = 4.0
-SAME_PLACE_M = 10.0
+_SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
-BEYOND_M = 1.0
+_BEYOND_M = 1.0
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
-STANDING_MPS = 0.05
+ROBOT_STANDS_MPS = 0.05
 STOP_S = 2.0
 STOP_WITHIN_M = 3.0
 """Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
@@ -133,7 +133,7 @@ class Referee:
             state.phase == "acting" and stands_before(robot.pose, event, state)
             for event, state in zip(self._scenario.events, step.events.states, strict=True)
         )
-        self._stood_ticks = self._stood_ticks + 1 if here and abs(robot.v_mps) < STANDING_MPS else 0
+        self._stood_ticks = self._stood_ticks + 1 if here and abs(robot.v_mps) < ROBOT_STANDS_MPS else 0
         if self._stood_ticks >= self._clock.ticks(STOP_S):
             return "stop"
         if all(step.route_s_after_m > event.route_s_m for event in self._scenario.events):
@@ -157,11 +157,11 @@ class Referee:
         """A thing may collide anew once it has been away for a second."""
         if not self._touching:
             return
-        gaps, beside = person_gaps(step, self._half_m), vehicles_within(step, self._half_m, APART_M)
+        gaps, beside = person_gaps(step, self._half_m), vehicles_within(step, self._half_m, _APART_M)
         for other, last_tick in list(self._touching.items()):
-            if gaps.get(other, np.inf) <= APART_M or other in beside:
+            if gaps.get(other, np.inf) <= _APART_M or other in beside:
                 self._touching[other] = step.tick
-            elif (step.tick - last_tick) * self._clock.tick_s > APART_S:
+            elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
                 del self._touching[other]
 
     def _out_of_lane(self, step: Step) -> Failure | None:
@@ -209,14 +209,14 @@ class Referee:
     def _reset(self, failure: Failure, step: Step) -> Reset:
         self._failed_at_s.append(failure.route_s_m)
         recent = self._failed_at_s[-SAME_PLACE_FAILURES:]
-        stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= SAME_PLACE_M
+        stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
         last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
         waypoints = np.arange(count) * WAYPOINT_STEP_M
         waypoints = waypoints[waypoints <= last_m]
         if stuck:
             self._failed_at_s.clear()
-            order = waypoints[waypoints > max(recent) + BEYOND_M]
+            order = waypoints[waypoints > max(recent) + _BEYOND_M]
         else:
             order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
         for s_m in order:
@@ -272,7 +272,7 @@ def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> se
 
 def fault_of(person: str, robot_speed_mps: float, step: Step) -> Fault:
     """Who moved into whom: a robot slower than 0.05 m/s was walked into; a standing person was driven into."""
-    if abs(robot_speed_mps) < STANDING_MPS:
+    if abs(robot_speed_mps) < ROBOT_STANDS_MPS:
         return "pedestrian_at_fault"
     people = step.street.people
     if person in people.ids:
@@ -280,6 +280,6 @@ def fault_of(person: str, robot_speed_mps: float, step: Step) -> Fault:
         pose = step.robot.pose
         to_robot = pose.xy - people.xy[i]
         closing = people.speed[i] * np.cos(people.heading[i] - np.arctan2(to_robot[1], to_robot[0]))
-        if closing > STANDING_MPS:
+        if closing > ROBOT_STANDS_MPS:
             return "shared"
     return "robot_at_fault"

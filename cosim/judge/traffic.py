@@ -23,11 +23,11 @@ from cosim.place import overlay
 from cosim.place.street_map import StreetMap, Strip
 
 BRAKES_MPS2: Final = 2.0
-AHEAD_M: Final = 40.0
+_AHEAD_M: Final = 40.0
 ASIDE_M: Final = 1.0
 """Within half the vehicle's width and this of its middle line somebody is in its way."""
 
-APART_S: Final = 2.0
+_APART_S: Final = 2.0
 
 
 class OnRoad(NamedTuple):
@@ -62,7 +62,7 @@ class Roadway:
         if not carriageway and (not crossing or signal is not None):
             return OnRoad()
         names = braking_for(pose, step.street, step.street_after, self._tick_s)
-        new = [name for name in names if (step.tick - self._last.get(name, -(10**9))) * self._tick_s > APART_S]
+        new = [name for name in names if (step.tick - self._last.get(name, -(10**9))) * self._tick_s > _APART_S]
         self._last |= dict.fromkeys(names, step.tick)
         return OnRoad(carriageway, len(new))
 
@@ -100,7 +100,7 @@ def braking_for(robot: Pose, before: Street, after: Street, tick_s: float) -> li
             continue
         others = np.concatenate([after.people.xy, np.delete(vehicles.xy, k, axis=0)])
         front = _ahead_m(vehicles.xy[k], float(vehicles.heading[k]), vehicles.size[k], robot.xy[None])[0]
-        if front < AHEAD_M and front <= _ahead_m(
+        if front < _AHEAD_M and front <= _ahead_m(
             vehicles.xy[k], float(vehicles.heading[k]), vehicles.size[k], others
         ).min(initial=math.inf):
             found.append(name)

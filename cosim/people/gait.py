@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.core.geometry import Floats
-from cosim.core.rows import Rows
+from cosim.core.rows import RowLookup
 
 REFERENCE_M: Final = 1.75
 """Stature of the person whose strides are listed."""
@@ -78,7 +78,7 @@ class Strides:
     """Counts everybody's strides. period_s: time between two updates."""
 
     period_s: float
-    _rows: Rows = field(default_factory=Rows)
+    _rows: RowLookup = field(default_factory=RowLookup)
     _table: Floats = field(default_factory=lambda: np.zeros((1, 5)))
 
     def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats) -> tuple[Floats, Floats]:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import numpy as np
 
 from cosim.core.state import People
-from cosim.people.steering import NEAR_M
+from cosim.people.steering import STEERING_NEAR_M
 from cosim.spec.events import Bystander, Event
 
 
@@ -22,7 +22,7 @@ def bystanders(people: People, events: Iterable[Event]) -> tuple[Bystander, ...]
         return ()
     own = {name for event in events for name in event.names}
     gap = people.xy[:, None] - people.xy[None, first:last]
-    near = ((gap * gap).sum(axis=2) < NEAR_M * NEAR_M).any(axis=1)
+    near = ((gap * gap).sum(axis=2) < STEERING_NEAR_M * STEERING_NEAR_M).any(axis=1)
     rows = [i for i in np.flatnonzero(near).tolist() if people.ids[i] not in own]
     if not rows:
         return ()

@@ -15,9 +15,9 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 
-EPS = 1e-9
+_EPS = 1e-9
 
-Vector = Floats | tuple[float, float]
+_Vector = Floats | tuple[float, float]
 """Two numbers: metres, or metres per second."""
 
 
@@ -34,7 +34,13 @@ class HalfPlane(NamedTuple):
 
 
 def half_plane(
-    apart_m: Vector, mine_mps: Vector, other_mps: Vector, radius_m: float, horizon_s: float, share: float, step_s: float
+    apart_m: _Vector,
+    mine_mps: _Vector,
+    other_mps: _Vector,
+    radius_m: float,
+    horizon_s: float,
+    share: float,
+    step_s: float,
 ) -> HalfPlane:
     """The velocities with which a disk does its share to keep clear of another one, ORCA^tau of the paper.
 
@@ -57,8 +63,8 @@ def half_plane(
     before_disk = along < 0.0 and along**2 >= radius_m**2 * (wx * wx + wy * wy)
     if distance_m <= radius_m or before_disk:
         size = math.hypot(wx, wy)
-        far_m = max(distance_m, EPS)
-        nx, ny = (wx / size, wy / size) if size > EPS else (-ax / far_m, -ay / far_m)
+        far_m = max(distance_m, _EPS)
+        nx, ny = (wx / size, wy / size) if size > _EPS else (-ax / far_m, -ay / far_m)
         inside = radius_m / horizon_s - (wx * nx + wy * ny)
     else:
         sin = radius_m / distance_m
@@ -76,9 +82,9 @@ def best_velocity(planes: Sequence[HalfPlane], preferred_mps: Floats, fastest_mp
     Where the half-planes leave none ("densely packed conditions"), the one that violates the worst of them least.
     """
     speed = math.hypot(*preferred_mps)
-    v = preferred_mps * min(1.0, fastest_mps / max(speed, EPS))
+    v = preferred_mps * min(1.0, fastest_mps / max(speed, _EPS))
     for i, plane in enumerate(planes):
-        if plane.excess(v) < -EPS:
+        if plane.excess(v) < -_EPS:
             found = _on_edge(plane, planes[:i], fastest_mps, preferred_mps, toward=False)
             if found is None:
                 return _least_violating(planes, i, v, fastest_mps)
@@ -102,8 +108,8 @@ def _on_edge(
     for other in others:
         gain = dx * other.nx + dy * other.ny
         short = other.offset - (x0 * other.nx + y0 * other.ny)
-        if abs(gain) < EPS:
-            if short > EPS:
+        if abs(gain) < _EPS:
+            if short > _EPS:
                 return None
         elif gain > 0.0:
             low = max(low, short / gain)
@@ -129,13 +135,13 @@ def _least_violating(planes: Sequence[HalfPlane], first: int, v: Floats, fastest
     worst = 0.0
     for i in range(first, len(planes)):
         plane = planes[i]
-        if -plane.excess(v) <= worst + EPS:
+        if -plane.excess(v) <= worst + _EPS:
             continue
         no_worse = [h for other in planes[:i] if (h := _no_worse(other, plane)) is not None]
         toward = np.array([plane.nx, plane.ny])
         found: Floats | None = toward * fastest_mps
         for k, bound in enumerate(no_worse):
-            if found is not None and bound.excess(found) < -EPS:
+            if found is not None and bound.excess(found) < -_EPS:
                 found = _on_edge(bound, no_worse[:k], fastest_mps, toward, toward=True)
         if found is not None:
             v = found

@@ -16,7 +16,7 @@ import numpy as np
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.orca import HalfPlane, best_velocity, half_plane
 
-NEAR_M: Final = 4.0
+STEERING_NEAR_M: Final = 4.0
 """Who is farther away is not looked at."""
 
 HORIZON_S: Final = 2.0
@@ -25,7 +25,7 @@ HORIZON_S: Final = 2.0
 ROOM_M: Final = 2 * PERSON_RADIUS_M
 """Middles of two people who pass keep so far apart, as long as that leaves a way."""
 
-LEAST_M: Final = 0.45
+SHOULDER_TO_SHOULDER_M: Final = 0.45
 """Middles of two people who touch shoulders: one squeezes through where nothing else is open. Nearer ones part."""
 
 PARTED_S: Final = 0.5
@@ -37,10 +37,10 @@ TURNS: Final = tuple((math.cos(math.radians(turn)), math.sin(math.radians(turn))
 GIVES: Final = 0.98
 """Those who stand nearer than two radii come no nearer than this share of their distance."""
 
-CROSSING: Final = 0.35
+_CROSSING: Final = 0.35
 """Sine of the angle between two ways from which on they cross."""
 
-EPS: Final = 1e-9
+_EPS: Final = 1e-9
 
 Vector = tuple[float, float]
 
@@ -87,16 +87,16 @@ def steered(
     the ground one may walk on. Only who is nearer than NEAR_M counts, and of those behind only who is too near.
     """
     speed_mps = math.hypot(*wanted_mps)
-    if speed_mps < EPS:
+    if speed_mps < _EPS:
         return wanted_mps
     disks = _seen(at_m, wanted_mps, neighbours, room_m)
     if not disks and all(_permits(wall, *wanted_mps) for wall in walls):
         return wanted_mps
-    if math.dist(moving_mps, wanted_mps) < EPS and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s:
+    if math.dist(moving_mps, wanted_mps) < _EPS and _meets_in_s(*wanted_mps, disks, walls, horizon_s) >= horizon_s:
         return wanted_mps
     heading_mps, is_open = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
     if not is_open:
-        disks = _seen(at_m, wanted_mps, neighbours, LEAST_M)
+        disks = _seen(at_m, wanted_mps, neighbours, SHOULDER_TO_SHOULDER_M)
         heading_mps, _ = _most_open(wanted_mps, moving_mps, disks, walls, horizon_s)
     planes = [half_plane(d.apart_m, moving_mps, d.moving_mps, d.keep_m, horizon_s, d.share, PARTED_S) for d in disks]
     planes += walls
@@ -113,8 +113,8 @@ def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], roo
         dx, dy = one.x_m - at_m[0], one.y_m - at_m[1]
         far_m = math.hypot(dx, dy)
         ahead = dx * wanted_mps[0] + dy * wanted_mps[1] > 0.0
-        if far_m < NEAR_M and (ahead or far_m < LEAST_M):
-            keep_m = min(room_m, max(GIVES * far_m, LEAST_M))
+        if far_m < STEERING_NEAR_M and (ahead or far_m < SHOULDER_TO_SHOULDER_M):
+            keep_m = min(room_m, max(GIVES * far_m, SHOULDER_TO_SHOULDER_M))
             room_m2 = dx * dx + dy * dy - keep_m * keep_m
             disks.append(_Disk((dx, dy), (one.vx_mps, one.vy_mps), keep_m, one.share, room_m2))
     return disks
@@ -123,7 +123,7 @@ def _seen(at_m: Vector, wanted_mps: Vector, neighbours: Sequence[Neighbour], roo
 def _lets_pass(disk: _Disk, wanted_mps: Vector) -> bool:
     """Whether somebody who steers the same way crosses from the left: of two, the one from the right goes first."""
     (dx, dy), (vx, vy), (x, y) = disk.apart_m, disk.moving_mps, wanted_mps
-    across = x * vy - y * vx < -CROSSING * math.hypot(x, y) * math.hypot(vx, vy)
+    across = x * vy - y * vx < -_CROSSING * math.hypot(x, y) * math.hypot(vx, vy)
     return disk.share < 1.0 and across and x * dy - y * dx > 0.0
 
 
@@ -140,7 +140,7 @@ def _most_open(
     best, latest_s = wanted_mps, _meets_in_s(x, y, disks, walls, horizon_s)
     if latest_s >= horizon_s:
         return best, True
-    side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > EPS else -1.0
+    side = 1.0 if x * moving_mps[1] - y * moving_mps[0] > _EPS else -1.0
     for cos, sin in TURNS:
         for aside in (side * sin, -side * sin):
             turned = (cos * x - aside * y, aside * x + cos * y)
@@ -185,4 +185,4 @@ def _meets_in_s(
 
 
 def _permits(plane: HalfPlane, x_mps: float, y_mps: float) -> bool:
-    return plane.nx * x_mps + plane.ny * y_mps - plane.offset >= -EPS
+    return plane.nx * x_mps + plane.ny * y_mps - plane.offset >= -_EPS

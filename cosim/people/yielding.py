@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M
 
-KEEP_M = 0.12
+STEP_ROUND_GAP_M = 0.12
 """Gap between a person's disk and the robot's outline at which the person begins to step round."""
 
 DRAWS_BACK_M = 0.015
@@ -27,7 +27,7 @@ FORESEEN_S = 0.6
 """How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
 
 
-class Body(NamedTuple):
+class RobotBody(NamedTuple):
     """The robot as people see it: its pose, half its length and width in metres, its speed."""
 
     pose: Pose
@@ -35,12 +35,12 @@ class Body(NamedTuple):
     v_mps: float = 0.0
 
 
-def within_reach_m(body: Body) -> float:
+def within_reach_m(body: RobotBody) -> float:
     """How near to the robot's middle somebody must be for a step to be led round it."""
-    return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + KEEP_M
+    return math.hypot(*body.half_m) + FORESEEN_S * max(body.v_mps, 0.0) + PERSON_RADIUS_M + STEP_ROUND_GAP_M
 
 
-def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.bool_] | None = None) -> Floats:
+def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArray[np.bool_] | None = None) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each, near a robot.
 
     People keep out of the ground that a moving robot is about to cover, too: who walks against it there steps aside.
@@ -56,7 +56,7 @@ def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.
     low, high = np.array([-length, -width]), np.array([length, width])
     reach = np.array([ahead, 0.0])
     near = (wanted - body.pose.xy) @ turn
-    if not (_gap(near, low, high + reach) < KEEP_M).any():
+    if not (_gap(near, low, high + reach) < STEP_ROUND_GAP_M).any():
         return wanted
     local = (before - body.pose.xy) @ turn
     step = near - local
@@ -68,21 +68,21 @@ def stepped_round(before: Floats, wanted: Floats, body: Body, stand: NDArray[np.
     normal = out / np.maximum(far, 1e-9)[:, None]
     inward = -(step * normal).sum(axis=1)
     tangent = np.column_stack([-normal[:, 1], normal[:, 0]])
-    slides = (_gap(near, low, high) < KEEP_M) & (inward > 0.0) & (far > 1e-6)
+    slides = (_gap(near, low, high) < STEP_ROUND_GAP_M) & (inward > 0.0) & (far > 1e-6)
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
     if stand is not None:
-        back = np.clip(KEEP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
+        back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
         comes_up = slides & stand
         moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
 
-    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < KEEP_M)
+    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < STEP_ROUND_GAP_M)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
     rounded: Floats = moved @ turn.T + body.pose.xy
     return rounded
 
 
-def touches(xy: Floats, body: Body, within_m: float = TOUCH_M) -> bool:
+def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
     """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
     local = (np.asarray(xy) - body.pose.xy)[None] @ np.array([[cos, -sin], [sin, cos]])

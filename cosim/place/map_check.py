@@ -15,7 +15,7 @@ from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
 from cosim.place.walk_graph import WalkGraph
 
-NARROW_M = 1.0
+_NARROW_M = 1.0
 """On a strip less wide than this a robot and a person cannot pass."""
 STUB_M = 1.0
 STEEP = 0.08
@@ -144,7 +144,7 @@ def check_map(
     areas = np.array([s.polygon.area for s in sidewalks])
     on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY]
     stacked = [s for s in stacked_on_roads(street_map, sidewalks) if s not in on_road]
-    narrow = [s for s in sidewalks if s.width_m < NARROW_M]
+    narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
     unit = _unit_reasons(street_map, graph, lengths)
     long_horizon = _long_horizon_reasons(street_map, graph, lengths)
     reasons = _unusable(street_map, unit, long_horizon)
@@ -251,7 +251,7 @@ def _starts(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) 
     return [
         s
         for s in street_map.strips.values()
-        if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= NARROW_M
+        if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= _NARROW_M
         if s.id not in street_map.steep
     ]
 

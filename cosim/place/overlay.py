@@ -20,7 +20,7 @@ from cosim.core.errors import MapError
 GRIDS_M = (1e-6, 1e-3, 1e-2)
 """Grids that repaired shapes are snapped to, one after another."""
 
-NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
 Shapes = NDArray[np.object_]
 
@@ -51,9 +51,9 @@ def union_all(shapes: Sequence[shapely.Geometry] | Shapes) -> Polygon | MultiPol
     return united
 
 
-def place_of(error: Exception) -> str:
+def where_geos_failed(error: Exception) -> str:
     """Where GEOS failed, in words: " near (12.3, 45.6)", or nothing when it does not say."""
-    found = re.search(rf"at ({NUMBER}) ({NUMBER})", str(error))
+    found = re.search(rf"at ({_NUMBER}) ({_NUMBER})", str(error))
     return f" near ({float(found[1]):.1f}, {float(found[2]):.1f})" if found else ""
 
 
@@ -82,4 +82,4 @@ def _tried(operation: Callable[..., Any], *shapes: Any) -> Any:
             return operation(*mended, grid_size=grid_m)
         except shapely.errors.GEOSException as error:
             refusal = error
-    raise MapError(f"the ground{place_of(refusal)} is too tangled to be put together: {refusal}") from refusal
+    raise MapError(f"the ground{where_geos_failed(refusal)} is too tangled to be put together: {refusal}") from refusal

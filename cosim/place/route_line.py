@@ -18,7 +18,7 @@ from cosim.place.street_map import Port, StreetMap, Strip, union_closed
 MARGINS_M = (0.6, 0.45, 0.3, 0.15, 0.02)
 """Distances from the edge of a corner that are tried for the line through it, widest first."""
 
-STEP_M = 1.0
+_STEP_M = 1.0
 SMOOTHING_ROUNDS = 2
 
 
@@ -91,8 +91,8 @@ def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Float
 
 def smoothed(line: Polyline) -> Polyline:
     """The line with its bends rounded by corner cutting and a point about every metre; the ends stay."""
-    points = line.resampled(STEP_M).points
+    points = line.resampled(_STEP_M).points
     for _ in range(SMOOTHING_ROUNDS):
         middle = (points[:-1] + points[1:]) / 2
         points = np.vstack([points[:1], middle, points[-1:]])
-    return Polyline(points).resampled(STEP_M)
+    return Polyline(points).resampled(_STEP_M)

@@ -131,7 +131,7 @@ class Located(NamedTuple):
 
 
 PieceKind = Literal["strip", "corner", "lane", "junction"]
-Piece = Strip | Corner | Lane | Junction
+_Piece = Strip | Corner | Lane | Junction
 
 
 @dataclass(frozen=True)
@@ -154,7 +154,7 @@ class StreetMap:
     features: tuple[Feature, ...] = ()
     terrain: Terrain | None = None
     elevation: Elevation | None = None
-    _trees: dict[str, tuple[shapely.STRtree, tuple[Piece, ...]]] = field(
+    _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )
 
@@ -170,7 +170,7 @@ class StreetMap:
         """Strips that no robot is sent over because the land is too steep there."""
         return frozenset(self.elevation.steep if self.elevation is not None else ())
 
-    def near(self, kind: PieceKind, area: shapely.Geometry) -> list[Piece]:
+    def near(self, kind: PieceKind, area: shapely.Geometry) -> list[_Piece]:
         """Pieces of `kind` whose polygon touches `area`, in the net's order."""
         tree, pieces = self._tree(kind)
         return [pieces[i] for i in np.sort(tree.query(area, predicate="intersects"))]
@@ -207,9 +207,9 @@ class StreetMap:
                 return Located("walk", best) if best else Located("road", lane.edge)
         return Located("walk", best) if best else Located("off", "")
 
-    def _tree(self, kind: str) -> tuple[shapely.STRtree, tuple[Piece, ...]]:
+    def _tree(self, kind: str) -> tuple[shapely.STRtree, tuple[_Piece, ...]]:
         if kind not in self._trees:
-            of_kind: dict[str, tuple[Piece, ...]] = {
+            of_kind: dict[str, tuple[_Piece, ...]] = {
                 "strip": tuple(self.strips.values()),
                 "corner": tuple(self.corners.values()),
                 "lane": tuple(self.lanes.values()),

@@ -18,16 +18,16 @@ STEP_S: Final = 0.2
 STEPS: Final = 20
 V_RAMP_MPS2: Final = 2.0
 W_RAMP_RADPS2: Final = 2.5
-W_RADPS: Final = 0.65
-GAIN_PER_S: Final = 2.4
-LOOK_M: Final = 1.0
+_W_RADPS: Final = 0.65
+_GAIN_PER_S: Final = 2.4
+_LOOK_M: Final = 1.0
 TURN_FIRST_RAD: Final = 1.1
 """A robot whose target is this far off its heading turns nearly on the spot."""
 COMMITS_M: Final = 5.0
 AIMS_RAD: Final = 0.12
 """Somebody farther than this whose walk points at the robot so exactly is taken to aim at it."""
 GRID_M: Final = 0.2
-BEYOND_M: Final = 10.0
+_BEYOND_M: Final = 10.0
 GOAL_LANE_M: Final = 0.6
 """The lane at the goal: it counts as reached from within 1 m."""
 
@@ -47,7 +47,7 @@ class Way:
     def __init__(self, route: Polyline) -> None:
         self.length_m = route.length_m
         end = route.at(route.length_m)
-        beyond = end.xy + BEYOND_M * np.array([math.cos(end.heading_rad), math.sin(end.heading_rad)])
+        beyond = end.xy + _BEYOND_M * np.array([math.cos(end.heading_rad), math.sin(end.heading_rad)])
         line = Polyline(np.vstack([route.points, beyond]))
         self._s = np.arange(0.0, line.length_m, GRID_M)
         self._x = np.interp(self._s, line.s_m, line.points[:, 0])
@@ -87,11 +87,11 @@ def steering(way: Way, plans: Plans, pose: Floats, s_m: Floats, after_s: float) 
     here = -(pose[:, 0] - x) * np.sin(heading) + (pose[:, 1] - y) * np.cos(heading)
     at_end = GOAL_LANE_M + 0.5 * np.maximum(way.length_m - s_m - 1.0, 0.0)
     lane = np.clip(plans.lane_m, -at_end, at_end)
-    reach = np.where(after_s >= plans.delay_s - 1e-9, plans.slope * LOOK_M, 0.0)
-    target = way.place(s_m + LOOK_M, here + np.clip(lane - here, -reach, reach))
+    reach = np.where(after_s >= plans.delay_s - 1e-9, plans.slope * _LOOK_M, 0.0)
+    target = way.place(s_m + _LOOK_M, here + np.clip(lane - here, -reach, reach))
     bearing = wrap_angles(np.arctan2(target[:, 1] - pose[:, 1], target[:, 0] - pose[:, 0]) - pose[:, 2])
     slowed = np.maximum(1.0 - np.abs(bearing) / TURN_FIRST_RAD, 0.05)
-    return plans.speed_mps * np.minimum(slowed * 1.35, 1.0), np.clip(GAIN_PER_S * bearing, -W_RADPS, W_RADPS)
+    return plans.speed_mps * np.minimum(slowed * 1.35, 1.0), np.clip(_GAIN_PER_S * bearing, -_W_RADPS, _W_RADPS)
 
 
 def foresee(

@@ -15,13 +15,13 @@ from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, People
 
 STANDS_MPS: Final = 0.15
-GAP_M: Final = 0.9
+_GAP_M: Final = 0.9
 """Two who leave less than this between their shoulders are not to be passed between."""
 FELLOWS_M: Final = 2.5
 """Talkers and queuers this near to each other belong together, whatever the gap."""
 
 
-def standing(people: People) -> np.ndarray:
+def who_stands(people: People) -> np.ndarray:
     """(N,) whether each of them stands."""
     still: np.ndarray = people.speed < STANDS_MPS
     return still
@@ -29,7 +29,7 @@ def standing(people: People) -> np.ndarray:
 
 def groups(people: People) -> list[list[int]]:
     """Rows of those who stand, group by group; one alone is a group of one."""
-    rows = np.flatnonzero(standing(people)).tolist()
+    rows = np.flatnonzero(who_stands(people)).tolist()
     left, found = set(rows), []
     for row in rows:
         if row not in left:
@@ -48,7 +48,7 @@ def groups(people: People) -> list[list[int]]:
 
 def _together(people: People, a: int, b: int) -> bool:
     apart_m = float(np.hypot(*(people.xy[a] - people.xy[b])))
-    if apart_m < 2 * PERSON_RADIUS_M + GAP_M:
+    if apart_m < 2 * PERSON_RADIUS_M + _GAP_M:
         return True
     return people.doing[a] == people.doing[b] and people.doing[a] in ("talk", "queue") and apart_m < FELLOWS_M
 

@@ -21,7 +21,7 @@ from cosim.episode.driver import Driver, Timer, told_of
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
 
-MOST_PX = 4096
+_MOST_PX = 4096
 LONGEST_NAME = 100
 
 
@@ -112,8 +112,8 @@ def _wrong(manifest: Manifest) -> str:
 
 
 def _wrong_camera(camera: CameraSpec) -> str:
-    if not all(1 <= side <= MOST_PX for side in (camera.width, camera.height)):
-        return f"camera must have sides of 1 to {MOST_PX} pixels, not {camera.width} x {camera.height}"
+    if not all(1 <= side <= _MOST_PX for side in (camera.width, camera.height)):
+        return f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x {camera.height}"
     if not 0.0 < camera.fov_deg < 180.0:
         return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
     if not all(map(math.isfinite, (*camera.mount_m, camera.pitch_down_deg))):

@@ -25,40 +25,40 @@ from cosim.core.state import PERSON_RADIUS_M, Command, People
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
 from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
-from cosim.policies.groups import distances, lines, standing
+from cosim.policies.groups import distances, lines, who_stands
 from cosim.policies.route import BODY_RADIUS_M, CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
 
-CRUISE_MPS: Final = 1.4
+_CRUISE_MPS: Final = 1.4
 LANES_M: Final = np.arange(-8, 9) * 0.25
-SPEEDS_MPS: Final = (1.4, 0.9, 0.45)
+_SPEEDS_MPS: Final = (1.4, 0.9, 0.45)
 MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
 """Delay in seconds and sideways metres per metre of a change of lanes."""
 OUT_OF_A_NOOK: Final = (0.0, 3.0)
 """The same of turning nearly on the spot first, at the slowest speed: past somebody whom it stands right before."""
 
-HORIZON_S: Final = 3.0
+_HORIZON_S: Final = 3.0
 """ORCA's tau."""
-AROUND_M: Final = 0.45
+_AROUND_M: Final = 0.45
 """Radius of the disk round the whole robot."""
-NOSE_M: Final = 0.18
+_NOSE_M: Final = 0.18
 """From the base centre to the middles of the two disks of the body."""
 
-CLEARANCE_M: Final = 0.3
-TIGHT_M: Final = 0.12
+_CLEARANCE_M: Final = 0.3
+_TIGHT_M: Final = 0.12
 LATER_M_PER_S: Final = 0.04
 """What is foreseen later may come out otherwise: so much nearer a plan may come for each second ahead."""
-NEARNESS_COST: Final = 15.0
+_NEARNESS_COST: Final = 15.0
 TOUCH_COST: Final = 60.0
 """m/s given up per metre nearer than the clearance, and nearer than a hand's breadth."""
 CAR_DEEP_M: Final = 0.5
 LANE_COST: Final = 0.25
-CHANGE_COST: Final = 0.4
+_CHANGE_COST: Final = 0.4
 FOLLOWED: Final = 0.6
 """Those who walk the robot's way may stop: they are foreseen so much slower than they walk."""
 EDGE_COST: Final = 6.0
 """m/s given up when all of a plan lies outside the walkable area."""
-EDGE_M: Final = 0.06
-PATIENCE_S: Final = 3.0
+_EDGE_M: Final = 0.06
+_PATIENCE_S: Final = 3.0
 STUCK_M: Final = 0.5
 """A robot that has not come this far for PATIENCE_S, and was not held, takes tighter ways."""
 NEAR_S: Final = 1.2
@@ -79,8 +79,8 @@ class Weights(NamedTuple):
     edge: float
 
 
-PATIENT: Final = Weights(CLEARANCE_M, 0.4, 1.0, EDGE_COST)
-STUCK: Final = Weights(TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
+PATIENT: Final = Weights(_CLEARANCE_M, 0.4, 1.0, EDGE_COST)
+STUCK: Final = Weights(_TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
 
 
 class Orca:
@@ -105,7 +105,7 @@ class Orca:
             raise ValueError("the orca policy needs privileged observations")
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
-        limit_mps = min(crossing_limit(known), stop_limit(known), CRUISE_MPS)
+        limit_mps = min(crossing_limit(known), stop_limit(known), _CRUISE_MPS)
         x_m, y_m, _ = known.robot.pose
         self._stuck_s += dt_s
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
@@ -129,16 +129,16 @@ class Orca:
         self, known: Privileged, plans: Plans, ahead: Ahead, gaps: Floats, out: Floats, wished: Floats, aim_m: float
     ) -> Floats:
         """How good each plan is, (K,) in m/s of speed."""
-        weights = PATIENT if self._stuck_s < PATIENCE_S else STUCK
+        weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
         near = max(round(NEAR_S / STEP_S), 1)
         velocity = (ahead.pose[near - 1, :, :2] - known.robot.pose.xy) / (near * STEP_S)
         off_wish = np.hypot(*(velocity - wished).T)
         progress = (ahead.s_m[-1] - known.route_s_m) / (STEPS * STEP_S)
-        lanes = LANE_COST * np.abs(plans.lane_m - aim_m) + CHANGE_COST * np.abs(plans.lane_m - self._lane_m)
-        nearness = NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
+        lanes = LANE_COST * np.abs(plans.lane_m - aim_m) + _CHANGE_COST * np.abs(plans.lane_m - self._lane_m)
+        nearness = _NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
         touch = TOUCH_COST * np.maximum(0.05 - gaps, 0.0)
         scores: Floats = weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
-        scores -= weights.edge * out + NEARNESS_COST * car_nearness(known, ahead)
+        scores -= weights.edge * out + _NEARNESS_COST * car_nearness(known, ahead)
         return scores
 
     def _way_of(self, known: Privileged) -> Way:
@@ -148,7 +148,7 @@ class Orca:
 
     def _room_of(self, known: Privileged) -> shapely.Geometry:
         if self._room is None or self._room[0] is not known.free:
-            room = shapely.buffer(known.free, -EDGE_M)
+            room = shapely.buffer(known.free, -_EDGE_M)
             shapely.prepare(room)
             self._room = (known.free, room)
         return self._room[1]
@@ -174,7 +174,7 @@ def nearby(known: Privileged) -> People:
 
 def walks(people: People) -> Floats:
     """(N, 2) m/s: how they walk; those who stand do not."""
-    speed = np.where(standing(people), 0.0, people.speed)
+    speed = np.where(who_stands(people), 0.0, people.speed)
     velocity: Floats = speed[:, None] * np.column_stack([np.cos(people.heading), np.sin(people.heading)])
     return velocity
 
@@ -213,8 +213,8 @@ def lane_past(known: Privileged, way: Way, room: shapely.Geometry, ends: Floats,
         gaps = (distances(points, ends) - PERSON_RADIUS_M - BODY_RADIUS_M).min(axis=(1, 2))
     out = ~shapely.contains_xy(room, points[..., 0], points[..., 1])
     out &= known.route_s_m + LANE_AHEAD_M < way.length_m
-    cost = LANE_COST * np.abs(LANES_M) + 0.5 * CHANGE_COST * np.abs(LANES_M - current_m)
-    cost += NEARNESS_COST * np.maximum(CLEARANCE_M - gaps, 0.0) + EDGE_COST * out.mean(axis=1)
+    cost = LANE_COST * np.abs(LANES_M) + 0.5 * _CHANGE_COST * np.abs(LANES_M - current_m)
+    cost += _NEARNESS_COST * np.maximum(_CLEARANCE_M - gaps, 0.0) + EDGE_COST * out.mean(axis=1)
     return float(LANES_M[int(np.argmin(cost))])
 
 
@@ -226,13 +226,13 @@ def bent(known: Privileged, way: Way, people: People, aim_m: float, limit_mps: f
     ahead = way.place(np.array(known.route_s_m + 2.0), np.array(lane_m)) - robot.pose.xy
     wish = limit_mps * ahead / max(float(np.hypot(*ahead)), 1e-9)
     mine = robot.v_mps * np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
-    radius_m = AROUND_M + PERSON_RADIUS_M + TIGHT_M
+    radius_m = _AROUND_M + PERSON_RADIUS_M + _TIGHT_M
     planes = [
-        half_plane(xy - robot.pose.xy, mine, velocity, radius_m, HORIZON_S, 1.0, 0.5)
-        for xy, velocity, still in zip(people.xy, walks(people), standing(people), strict=True)
+        half_plane(xy - robot.pose.xy, mine, velocity, radius_m, _HORIZON_S, 1.0, 0.5)
+        for xy, velocity, still in zip(people.xy, walks(people), who_stands(people), strict=True)
         if not still
     ]
-    return best_velocity(planes, wish, CRUISE_MPS)
+    return best_velocity(planes, wish, _CRUISE_MPS)
 
 
 def lanes_inside(known: Privileged, way: Way, room: shapely.Geometry) -> Floats:
@@ -246,7 +246,7 @@ def lanes_inside(known: Privileged, way: Way, room: shapely.Geometry) -> Floats:
 
 def all_plans(lanes: Floats, limit_mps: float) -> Plans:
     """Every lane at every speed in every manner, and waiting."""
-    speeds = [min(speed, limit_mps) for speed in SPEEDS_MPS]
+    speeds = [min(speed, limit_mps) for speed in _SPEEDS_MPS]
     rows = [(lane, speed, slope, delay) for lane in lanes for speed in speeds for delay, slope in MANOEUVRES]
     rows += [(lane, speeds[-1], OUT_OF_A_NOOK[1], OUT_OF_A_NOOK[0]) for lane in lanes]
     rows.append((0.0, 0.0, MANOEUVRES[0][1], 0.0))
@@ -255,7 +255,7 @@ def all_plans(lanes: Floats, limit_mps: float) -> Plans:
 
 def foreseen(known: Privileged, way: Way, plans: Plans, people: People, ends: Floats) -> tuple[Ahead, Floats]:
     """What becomes of the plans, and the smallest gap (K,) m of each between the body and anybody."""
-    moving = ~standing(people)
+    moving = ~who_stands(people)
     xy, velocity = people.xy[moving], followed(known, people)[moving]
     robot = known.robot
     ahead = foresee(way, plans, robot.pose, known.route_s_m, (robot.v_mps, robot.w_radps), xy, velocity)
@@ -274,7 +274,7 @@ def foreseen(known: Privileged, way: Way, plans: Plans, people: People, ends: Fl
 def bodies(ahead: Ahead) -> tuple[Floats, Floats]:
     """(STEPS, K, 2) m each: the middles of the two disks of the body."""
     heading = ahead.pose[..., 2]
-    nose = NOSE_M * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    nose = _NOSE_M * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     return ahead.pose[..., :2] + nose, ahead.pose[..., :2] - nose
 
 
@@ -297,7 +297,7 @@ def car_nearness(known: Privileged, ahead: Ahead) -> Floats:
         away = cars[:, None] - body[:, :, None]
         apart = np.sqrt(np.einsum("...i,...i", away, away)) - radii
         gaps = np.minimum(gaps, apart.min(axis=-1) - BODY_RADIUS_M)
-    nearness: Floats = np.clip(CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
+    nearness: Floats = np.clip(_CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
     return nearness
 
 

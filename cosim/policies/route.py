@@ -16,8 +16,8 @@ from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command
 from cosim.episode.ports import Manifest, Observation, Privileged
 
-CRUISE_MPS = 1.5
-SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])
+_CRUISE_MPS = 1.5
+_SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])
 """Speeds that are compared, the last one waiting."""
 
 OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
@@ -26,7 +26,7 @@ SHIFT_M_PER_M = 0.35
 SHIFT_AFTER_M = 0.3
 """Changing lanes: sideways metres per metre driven, and metres until it begins to show."""
 
-LOOK_AHEAD_M = 1.2
+_LOOK_AHEAD_M = 1.2
 GAIN_P_PER_S = 2.4
 GAIN_D = 0.12
 W_RADPS = 0.65
@@ -43,14 +43,14 @@ BODY_RADIUS_M = 0.33
 CAR_RADIUS_M = 1.1
 """A vehicle as three disks along its length."""
 
-CLEARANCE_M = 0.3
-TIGHT_M = 0.1
+_CLEARANCE_M = 0.3
+_TIGHT_M = 0.1
 OFFSET_COST = 0.25
-CHANGE_COST = 0.5
-NEARNESS_COST = 15.0
+_CHANGE_COST = 0.5
+_NEARNESS_COST = 15.0
 """Costs in m/s of speed given up: per metre beside the route, per metre of change, per metre too near."""
 
-PATIENCE_S = 3.0
+_PATIENCE_S = 3.0
 SEEN_M = 11.0
 
 
@@ -75,23 +75,23 @@ class Route:
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
 
-        limit_mps = min(crossing_limit(known), CRUISE_MPS)
+        limit_mps = min(crossing_limit(known), _CRUISE_MPS)
         held = limit_mps < 0.1
         self._stopped_s = 0.0 if observation.v_mps > 0.1 or held else self._stopped_s + dt_s
-        self._offset_m, free_mps = best_lane(known, self._offset_m, patient=self._stopped_s < PATIENCE_S)
+        self._offset_m, free_mps = best_lane(known, self._offset_m, patient=self._stopped_s < _PATIENCE_S)
 
         bearing_rad = bearing_to(known, self._offset_m)
         rate_radps = (bearing_rad - self._bearing_rad) / dt_s
         self._bearing_rad = bearing_rad
         w_radps = GAIN_P_PER_S * bearing_rad + GAIN_D * max(-2.0, min(2.0, rate_radps))
-        turning_mps = 0.0 if abs(bearing_rad) > 1.2 else CRUISE_MPS * (1.0 - abs(bearing_rad) / 1.2) + 0.05
+        turning_mps = 0.0 if abs(bearing_rad) > 1.2 else _CRUISE_MPS * (1.0 - abs(bearing_rad) / 1.2) + 0.05
         return Command(min(limit_mps, free_mps, turning_mps), max(-W_RADPS, min(W_RADPS, w_radps)))
 
 
 def bearing_to(known: Privileged, offset_m: float) -> float:
     """Bearing, in the robot's frame, of the point LOOK_AHEAD_M ahead on the lane at `offset_m` (left positive)."""
     x, y, heading = known.robot.pose
-    look_m = LOOK_AHEAD_M if known.route_s_m + LOOK_AHEAD_M < known.route.length_m else 0.8
+    look_m = _LOOK_AHEAD_M if known.route_s_m + _LOOK_AHEAD_M < known.route.length_m else 0.8
     ahead = known.route.at(min(known.route_s_m + look_m, known.route.length_m))
     lateral_m, shift_m = lateral_of(known), SHIFT_M_PER_M * look_m
     lane_m = lateral_m + max(-shift_m, min(shift_m, offset_m - lateral_m))
@@ -143,16 +143,16 @@ def best_lane(known: Privileged, current_m: float, *, patient: bool) -> tuple[fl
     """
     centres, velocities, radii = obstacles(known)
     if not len(centres):
-        return 0.0, CRUISE_MPS
+        return 0.0, _CRUISE_MPS
     paths = plans(known.route, known.route_s_m, lateral_of(known))
     gaps = smallest_gaps(paths, known.robot.pose.heading_rad, centres, velocities, radii)
     inside = np.asarray(shapely.contains_xy(known.free, paths[:, 0, :, 0], paths[:, 0, :, 1])).all(axis=1)
     gaps[~inside & (OFFSETS_M != 0.0), :-1] = -np.inf
-    clearance_m, effort_cost = (CLEARANCE_M, 1.0) if patient else (TIGHT_M, 0.1)
-    effort = OFFSET_COST * np.abs(OFFSETS_M) + CHANGE_COST * np.abs(OFFSETS_M - current_m)
-    score = SPEEDS_MPS - effort_cost * effort[:, None] - NEARNESS_COST * np.maximum(clearance_m - gaps, 0.0)
+    clearance_m, effort_cost = (_CLEARANCE_M, 1.0) if patient else (_TIGHT_M, 0.1)
+    effort = OFFSET_COST * np.abs(OFFSETS_M) + _CHANGE_COST * np.abs(OFFSETS_M - current_m)
+    score = _SPEEDS_MPS - effort_cost * effort[:, None] - _NEARNESS_COST * np.maximum(clearance_m - gaps, 0.0)
     lane, speed = np.unravel_index(int(np.argmax(score)), score.shape)
-    return float(OFFSETS_M[lane]), float(SPEEDS_MPS[speed])
+    return float(OFFSETS_M[lane]), float(_SPEEDS_MPS[speed])
 
 
 def lateral_of(known: Privileged) -> float:
@@ -191,7 +191,7 @@ def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
 
 def plans(route: Polyline, s_m: float, lateral_m: float) -> Floats:
     """Where the robot would be on each lane, at each speed, at each of TIMES_S: (lanes, speeds, times, 2) metres."""
-    driven = SPEEDS_MPS[:, None] * TIMES_S
+    driven = _SPEEDS_MPS[:, None] * TIMES_S
     along = np.minimum(s_m + driven, route.length_m)
     x, y = np.interp(along, route.s_m, route.points[:, 0]), np.interp(along, route.s_m, route.points[:, 1])
     ahead = np.minimum(along + 0.2, route.length_m)

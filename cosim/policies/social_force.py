@@ -46,9 +46,9 @@ ACTS_FOR_S: Final = 0.5
 """Forces change the velocity over this time to give the one that the robot turns to."""
 TOUCHING_M: Final = 0.05
 """Outlines are never nearer than this for the force, which would grow beyond all bounds."""
-LOOK_M: Final = 2.0
-GAIN_PER_S: Final = 2.0
-NEAR_M: Final = 8.0
+_LOOK_M: Final = 2.0
+_GAIN_PER_S: Final = 2.0
+_NEAR_M: Final = 8.0
 
 
 class SocialForce:
@@ -69,14 +69,14 @@ class SocialForce:
         wanted = velocity + ACTS_FOR_S * force(known, velocity)
         speed = min(math.hypot(*wanted), 1.3 * DESIRED_MPS, crossing_limit(known))
         off_rad = wrap_angle(math.atan2(wanted[1], wanted[0]) - heading)
-        w_radps = max(-W_RADPS, min(W_RADPS, GAIN_PER_S * off_rad))
+        w_radps = max(-W_RADPS, min(W_RADPS, _GAIN_PER_S * off_rad))
         return Command(speed * max(math.cos(off_rad), 0.0), w_radps)
 
 
 def force(known: Privileged, velocity: Floats) -> Floats:
     """The acceleration (2,) m/s2 of a robot that drives at `velocity` (2,)."""
     here = known.robot.pose.xy
-    ahead = known.route.at(min(known.route_s_m + LOOK_M, known.route.length_m)).xy - here
+    ahead = known.route.at(min(known.route_s_m + _LOOK_M, known.route.length_m)).xy - here
     direction = ahead / max(math.hypot(*ahead), 1e-9)
     pull = (DESIRED_MPS * direction - velocity) / RELAXATION_S
     pushes = seen(from_people(known.people, here, velocity), direction)
@@ -101,7 +101,7 @@ def from_people(people: People, here: Floats, velocity: Floats) -> Floats:
     both = near + then
     b = 0.5 * np.sqrt(np.maximum(both**2 - (step**2).sum(axis=1), (2 * TOUCHING_M) ** 2))
     along = 0.5 * (away / near[:, None] + from_step / then[:, None])
-    strength = PEOPLE_MPS2 * np.exp(-b / PEOPLE_M) * both / (2.0 * b) * (r < NEAR_M)
+    strength = PEOPLE_MPS2 * np.exp(-b / PEOPLE_M) * both / (2.0 * b) * (r < _NEAR_M)
     pushes: Floats = strength[:, None] * along
     return pushes
 

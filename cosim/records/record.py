@@ -25,7 +25,7 @@ from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
 from cosim.spec.scenario import Scenario, content_hash
 
-SCHEMA = 1
+_SCHEMA = 1
 NO_RENDERER = "none"
 """The renderer of an episode whose policy has no camera."""
 
@@ -76,7 +76,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     failures: tuple[Failure, ...] = ()
     events: tuple[TriggeredEvent, ...] = ()
     injections: tuple[Injected, ...] = ()
-    schema: int = SCHEMA
+    schema: int = _SCHEMA
     clock: dict[str, float] = {}
 
     def save(self, path: Path) -> None:
@@ -95,8 +95,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
             record = msgspec.json.decode(path.read_bytes(), type=cls)
         except (OSError, msgspec.DecodeError) as error:
             raise RunError(f"{path}: not an episode record: {error}") from error
-        if record.schema != SCHEMA:
-            raise RunError(f"{path}: record schema {record.schema}; this version reads {SCHEMA}")
+        if record.schema != _SCHEMA:
+            raise RunError(f"{path}: record schema {record.schema}; this version reads {_SCHEMA}")
         return record
 
 
@@ -143,7 +143,7 @@ class StateHash:
         return self._hash.hexdigest()
 
 
-def row_of(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
+def log_row(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
     """The 14 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
     robot = step.motion.robot
     track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
@@ -175,7 +175,7 @@ class Recorder:
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
-        self._rows.append(row_of(step, verdict, road))
+        self._rows.append(log_row(step, verdict, road))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
             people = step.street_after.people
             for i in np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M):

@@ -23,7 +23,7 @@ WORST: dict[str, float] = {"success": 0.0, "goal_reached": 0.0, "route_completio
 """What a crashed episode counts as: it is scheduled, so it stays in these means. An invalid one has no measures."""
 
 
-def row_of(record: Record) -> dict[str, Any]:
+def table_row(record: Record) -> dict[str, Any]:
     """One flat row. A function of scenario, policy and versions alone: wall times are left out."""
     row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
     row["metric_schema"] = metrics.SCHEMA
@@ -36,7 +36,7 @@ def row_of(record: Record) -> dict[str, Any]:
 
 def table_of(records: Iterable[Record]) -> pd.DataFrame:
     """One row per episode, sorted by scenario id, whatever order they ended in."""
-    rows = sorted((row_of(record) for record in records), key=lambda row: str(row["scenario"]))
+    rows = sorted((table_row(record) for record in records), key=lambda row: str(row["scenario"]))
     asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
     columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
     return pd.DataFrame(rows, columns=columns)

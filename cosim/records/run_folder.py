@@ -26,7 +26,7 @@ import pandas as pd
 
 from cosim.core.errors import MachineError, RunError, unknown, unwritable
 from cosim.records.record import Record
-from cosim.records.results import row_of, table_of
+from cosim.records.results import table_of, table_row
 from cosim.spec.scenario import Suite, write_suite
 
 DATABASE = "results.sqlite"
@@ -137,7 +137,7 @@ class RunFolder:
 
     def add(self, record: Record) -> None:
         """Append a finished episode. A second one of the same scenario is not taken."""
-        row = json.dumps(row_of(record), sort_keys=True)
+        row = json.dumps(table_row(record), sort_keys=True)
         text = msgspec.json.encode(record).decode()
         try:
             with closing(_connect(self.path)) as database, database:

@@ -17,10 +17,10 @@ from cosim.core.geometry import Floats
 from cosim.episode.log import Log
 from cosim.place.street_map import Lane, StreetMap
 from cosim.records.record import Record
-from cosim.report.legend import Colour, Image, legend, wide_px
+from cosim.report.legend import Image, Rgb255, legend, wide_px
 from cosim.spec.scenario import Scenario
 
-MARGIN_M: Final = 25.0
+_MARGIN_M: Final = 25.0
 LONGEST_PX: Final = 2400
 USUAL_PX: Final = 1400
 """Longest side of the picture of a short way."""
@@ -33,19 +33,19 @@ FAILURE_RING_M: Final = 0.6
 END_M: Final = 0.6
 """Radius of the dots at start and goal."""
 
-GROUND: Final[Colour] = (214, 226, 214)
-ROAD: Final[Colour] = (120, 120, 124)
-VERGE: Final[Colour] = (150, 200, 150)
-WALK: Final[Colour] = (238, 236, 230)
-CROSSING: Final[Colour] = (250, 250, 190)
-ROUTE: Final[Colour] = (60, 120, 220)
-TRACK: Final[Colour] = (20, 20, 20)
-BARRIER: Final[Colour] = (210, 30, 30)
-PERSON: Final[Colour] = (150, 120, 190)
-EVENT: Final[Colour] = (230, 120, 0)
-RESIDENT: Final[Colour] = (0, 140, 110)
-RESET: Final[Colour] = (120, 120, 120)
-FAILURES: Final[dict[str, Colour]] = {"collision": (220, 0, 0), "out_of_lane": (190, 0, 190), "freezing": (0, 140, 200)}
+GROUND_COLOUR: Final[Rgb255] = (214, 226, 214)
+ROAD: Final[Rgb255] = (120, 120, 124)
+VERGE: Final[Rgb255] = (150, 200, 150)
+_WALK: Final[Rgb255] = (238, 236, 230)
+_CROSSING: Final[Rgb255] = (250, 250, 190)
+ROUTE: Final[Rgb255] = (60, 120, 220)
+TRACK: Final[Rgb255] = (20, 20, 20)
+BARRIER: Final[Rgb255] = (210, 30, 30)
+PERSON: Final[Rgb255] = (150, 120, 190)
+EVENT: Final[Rgb255] = (230, 120, 0)
+RESIDENT: Final[Rgb255] = (0, 140, 110)
+RESET: Final[Rgb255] = (120, 120, 120)
+FAILURES: Final[dict[str, Rgb255]] = {"collision": (220, 0, 0), "out_of_lane": (190, 0, 190), "freezing": (0, 140, 200)}
 
 
 class Sheet:
@@ -56,7 +56,7 @@ class Sheet:
         self.px_per_m = min(px_per_m, LONGEST_PX / max(x1 - x0, y1 - y0))
         self._x0, self._y1 = x0, y1
         width, height = math.ceil((x1 - x0) * self.px_per_m), math.ceil((y1 - y0) * self.px_per_m)
-        self.image: Image = np.full((height, width, 3), GROUND, dtype=np.uint8)
+        self.image: Image = np.full((height, width, 3), GROUND_COLOUR, dtype=np.uint8)
         self._labels: list[Polygon] = []
 
     def px(self, xy: Floats) -> NDArray[np.int32]:
@@ -65,22 +65,22 @@ class Sheet:
         at = np.column_stack([xy[:, 0] - self._x0, self._y1 - xy[:, 1]]) * self.px_per_m * 16
         return np.round(at).astype(np.int32)
 
-    def area(self, shape: Polygon | MultiPolygon, colour: Colour) -> None:
+    def area(self, shape: Polygon | MultiPolygon, colour: Rgb255) -> None:
         for part in shapely.get_parts(shape):
             if isinstance(part, Polygon) and not part.is_empty:
                 rings = [self.px(np.array(ring.coords)) for ring in (part.exterior, *part.interiors)]
                 cv2.fillPoly(self.image, rings, colour, cv2.LINE_AA, 4)
 
-    def line(self, xy: Floats, colour: Colour, width_m: float) -> None:
+    def line(self, xy: Floats, colour: Rgb255, width_m: float) -> None:
         thickness = max(1, round(width_m * self.px_per_m))
         cv2.polylines(self.image, [self.px(xy)], False, colour, thickness, cv2.LINE_AA, 4)
 
-    def dot(self, xy: Floats, colour: Colour, radius_m: float, *, filled: bool = True) -> None:
+    def dot(self, xy: Floats, colour: Rgb255, radius_m: float, *, filled: bool = True) -> None:
         radius = max(2, round(radius_m * self.px_per_m))
         for x, y in self.px(xy):
             cv2.circle(self.image, (int(x), int(y)), radius * 16, colour, -1 if filled else 2, cv2.LINE_AA, 4)
 
-    def text(self, xy: Sequence[float], words: str, colour: Colour, beside_m: float = 0.0, size: float = 0.5) -> None:
+    def text(self, xy: Sequence[float], words: str, colour: Rgb255, beside_m: float = 0.0, size: float = 0.5) -> None:
         """Words on a light plate near a place: below it, above it or beside it, where there is least under them.
 
         beside_m: clear of what is drawn so far around the place; size: of the words, in OpenCV's units.
@@ -115,7 +115,7 @@ class Sheet:
 def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: Log) -> Image:
     """The picture of an episode, (H, W, 3) uint8 RGB."""
     route = np.array(scenario.route)
-    low, high = route.min(axis=0) - MARGIN_M, route.max(axis=0) + MARGIN_M
+    low, high = route.min(axis=0) - _MARGIN_M, route.max(axis=0) + _MARGIN_M
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1])))
     draw_streets(sheet, street_map, shapely.box(*bounds))
@@ -152,9 +152,9 @@ def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
             if lane.kind == kind:
                 sheet.area(lane.polygon, colour)
     for corner in street_map.near("corner", area):
-        sheet.area(corner.polygon, WALK)
+        sheet.area(corner.polygon, _WALK)
     for strip in street_map.near("strip", area):
-        sheet.area(strip.polygon, CROSSING if strip.id.startswith(":") else WALK)
+        sheet.area(strip.polygon, _CROSSING if strip.id.startswith(":") else _WALK)
 
 
 def draw_track(sheet: Sheet, log: Log) -> None:
@@ -173,7 +173,7 @@ def draw_track(sheet: Sheet, log: Log) -> None:
                 sheet.line(np.array(ends), RESET, 0.1)
 
 
-def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str, Colour]]:
+def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str, Rgb255]]:
     """What stands below the picture: how the episode went, and what each colour means."""
     measures = record.measures
     return [

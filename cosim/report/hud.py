@@ -7,12 +7,12 @@ from typing import Final, NamedTuple
 import cv2
 import numpy as np
 
-from cosim.report.legend import Colour, Image
+from cosim.report.legend import Image, Rgb255
 
-INK: Final[Colour] = (245, 245, 245)
-QUIET: Final[Colour] = (190, 196, 204)
-GOOD: Final[Colour] = (120, 220, 140)
-BAD: Final[Colour] = (255, 110, 90)
+INK: Final[Rgb255] = (245, 245, 245)
+QUIET: Final[Rgb255] = (190, 196, 204)
+GOOD: Final[Rgb255] = (120, 220, 140)
+BAD: Final[Rgb255] = (255, 110, 90)
 CAPTION_S: Final = 2.5
 """How long a caption stays."""
 _FONT: Final = cv2.FONT_HERSHEY_DUPLEX
@@ -71,7 +71,7 @@ def shade(image: Image, area: tuple[int, int, int, int], strength: float = 0.6) 
     image[y0:y1, x0:x1] = (image[y0:y1, x0:x1] * (1.0 - strength)).astype(np.uint8)
 
 
-def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Colour = INK) -> None:
+def words(image: Image, text: str, at: tuple[int, int], size: float, colour: Rgb255 = INK) -> None:
     """One line of text; at: x, y of its lower left."""
     cv2.putText(image, text, at, _FONT, size, colour, 1, cv2.LINE_AA)
 
@@ -90,7 +90,7 @@ def bar(image: Image, area: Area, left: str, right: str, share: float) -> None:
     words(image, right, (area.width - _MARGIN_PX - long, y), size)
 
 
-def caption(image: Image, area: Area, text: str, colour: Colour) -> None:
+def caption(image: Image, area: Area, text: str, colour: Rgb255) -> None:
     """A line in the upper middle of an area."""
     size = max(0.5, 0.9 * area.height / 676)
     long, tall = cv2.getTextSize(text, _FONT, size, 1)[0]

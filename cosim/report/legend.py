@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Colour = tuple[int, int, int]
+Rgb255 = tuple[int, int, int]
 Image = NDArray[np.uint8]
 
 LINE_PX: Final = 22
@@ -20,7 +20,7 @@ _FONT: Final = cv2.FONT_HERSHEY_SIMPLEX
 _SIZE: Final = 0.5
 
 
-def legend(image: Image, cells: Sequence[tuple[str, Colour]]) -> Image:
+def legend(image: Image, cells: Sequence[tuple[str, Rgb255]]) -> Image:
     """The picture, (H, W, 3) uint8 RGB, with a white band below it that holds every cell: words and their colour.
 
     A cell that no longer fits into a line begins the next one; one that is wider than the picture breaks at blanks.
@@ -40,10 +40,10 @@ def wide_px(words: str, size: float = _SIZE) -> int:
     return int(cv2.getTextSize(words, _FONT, size, 1)[0][0])
 
 
-def _lines(cells: Sequence[tuple[str, Colour]], width_px: int) -> list[list[tuple[str, Colour]]]:
+def _lines(cells: Sequence[tuple[str, Rgb255]], width_px: int) -> list[list[tuple[str, Rgb255]]]:
     """The cells in lines that are no wider than the picture, unless a single word is."""
     room = width_px - 2 * MARGIN_PX
-    lines: list[list[tuple[str, Colour]]] = [[]]
+    lines: list[list[tuple[str, Rgb255]]] = [[]]
     left = room
     for words, colour in cells:
         for piece in _pieces(words, room):

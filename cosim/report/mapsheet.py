@@ -13,11 +13,11 @@ from cosim.core.errors import unwritable
 from cosim.place.map_check import MapCheck
 from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import TRACK, Sheet, draw_streets
-from cosim.report.legend import Colour, Image, legend
+from cosim.report.legend import Image, Rgb255, legend
 
-MARGIN_M: Final = 20.0
-SIGNAL: Final[Colour] = (30, 150, 60)
-MARKS: Final[dict[str, tuple[Colour, str]]] = {
+_MARGIN_M: Final = 20.0
+SIGNAL: Final[Rgb255] = (30, 150, 60)
+MARKS: Final[dict[str, tuple[Rgb255, str]]] = {
     "island": ((200, 60, 200), "cut off from the main island"),
     "narrow": ((230, 140, 0), "narrower than 1 m"),
     "on_road": ((220, 0, 0), "mostly on the road"),
@@ -34,7 +34,7 @@ MARKS: Final[dict[str, tuple[Colour, str]]] = {
 def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, float, float] | None = None) -> Image:
     """The picture of a map, or of the `part` x0, y0, x1, y1 (metres) of it, (H, W, 3) uint8 RGB."""
     x0, y0, x1, y1 = street_map.bounds if part is None else part
-    margin_m = MARGIN_M if part is None else 0.0
+    margin_m = _MARGIN_M if part is None else 0.0
     bounds = (x0 - margin_m, y0 - margin_m, x1 + margin_m, y1 + margin_m)
     sheet, area = Sheet(bounds), shapely.box(*bounds)
     draw_streets(sheet, street_map, area)
@@ -60,7 +60,7 @@ def write_png(image: Image, path: Path) -> None:
         raise unwritable(path, error) from error
 
 
-def _facts(check: MapCheck) -> list[tuple[str, Colour]]:
+def _facts(check: MapCheck) -> list[tuple[str, Rgb255]]:
     """What stands below the picture: the figures, then what each colour means."""
     kinds = [kind for kind in MARKS if any(problem.kind == kind for problem in check.problems)]
     crossings = f"{check.crossings} crossings, {check.signalised} with signals"

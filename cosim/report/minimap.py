@@ -12,24 +12,24 @@ import shapely
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, People, RobotState, Street
 from cosim.place.street_map import StreetMap
-from cosim.report.above import BARRIER, EVENT, GROUND, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
-from cosim.report.legend import Colour, Image
+from cosim.report.above import BARRIER, EVENT, GROUND_COLOUR, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
+from cosim.report.legend import Image, Rgb255
 from cosim.spec.scenario import Scenario
 
-REACH_M: Final = 11.0
+MINIMAP_REACH_M: Final = 11.0
 """Metres from the middle of the map to its nearer borders."""
-AHEAD_M: Final = 4.0
+_AHEAD_M: Final = 4.0
 """The middle of the map is so far ahead of the robot."""
 SHARPEST_PX_PER_M: Final = 16.0
-ROBOT: Final[Colour] = (20, 20, 20)
-NOSE: Final[Colour] = (90, 200, 255)
-VEHICLE: Final[Colour] = (60, 80, 130)
-WALK: Final[Colour] = (0, 170, 80)
-RED: Final[Colour] = (220, 30, 30)
-INK: Final[Colour] = (40, 40, 40)
-COLOURS: Final[dict[str, Colour]] = {"e": EVENT, "n": RESIDENT}
+ROBOT: Final[Rgb255] = (20, 20, 20)
+NOSE: Final[Rgb255] = (90, 200, 255)
+VEHICLE: Final[Rgb255] = (60, 80, 130)
+_WALK: Final[Rgb255] = (0, 170, 80)
+RED_SIGNAL: Final[Rgb255] = (220, 30, 30)
+_INK: Final[Rgb255] = (40, 40, 40)
+COLOURS: Final[dict[str, Rgb255]] = {"e": EVENT, "n": RESIDENT}
 """Of people, by the first letter of their id; all others are background walkers."""
-NOSE_M: Final = 0.62
+_NOSE_M: Final = 0.62
 """From the middle of a person to the tip that shows where the body faces."""
 
 
@@ -41,7 +41,7 @@ class Minimap:
 
     def __init__(self, street_map: StreetMap, scenario: Scenario, footprint_m: tuple[float, float]) -> None:
         route = np.array(scenario.route)
-        low, high = route.min(axis=0) - 4.0 * REACH_M, route.max(axis=0) + 4.0 * REACH_M
+        low, high = route.min(axis=0) - 4.0 * MINIMAP_REACH_M, route.max(axis=0) + 4.0 * MINIMAP_REACH_M
         bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
         sheet = Sheet(bounds, SHARPEST_PX_PER_M)
         draw_streets(sheet, street_map, shapely.box(*bounds))
@@ -62,14 +62,14 @@ class Minimap:
         is red. A word says what event people do.
         """
         width, height = size_px
-        half_m = REACH_M * np.array([width, height]) / min(width, height)
-        middle = robot.pose.xy + AHEAD_M * ahead / np.hypot(*ahead)
+        half_m = MINIMAP_REACH_M * np.array([width, height]) / min(width, height)
+        middle = robot.pose.xy + _AHEAD_M * ahead / np.hypot(*ahead)
         (x0, y0), (x1, y1) = (middle - half_m).tolist(), (middle + half_m).tolist()
         sheet = Sheet((x0, y0, x1, y1), max(width, height) / (2.0 * half_m.max()))
         sheet.image = self._ground(x0, y1, sheet.px_per_m, size_px)
         for crossing, line in self._lights.items():
             if crossing in street.signals:
-                sheet.line(line, WALK if street.signals[crossing].walk else RED, 0.4)
+                sheet.line(line, _WALK if street.signals[crossing].walk else RED_SIGNAL, 0.4)
         for xy, heading, size_m in zip(street.vehicles.xy, street.vehicles.heading, street.vehicles.size, strict=True):
             sheet.area(shapely.Polygon(_box(xy, heading, size_m)), VEHICLE)
         _draw_people(sheet, street.people)
@@ -88,7 +88,7 @@ class Minimap:
         onto = np.array([[zoom, 0.0, left], [0.0, zoom, upper]])
         how = cv2.INTER_AREA if zoom > 1.0 else cv2.INTER_LINEAR
         ground: Image = cv2.warpAffine(
-            streets.image, onto, size_px, flags=how | cv2.WARP_INVERSE_MAP, borderValue=GROUND
+            streets.image, onto, size_px, flags=how | cv2.WARP_INVERSE_MAP, borderValue=GROUND_COLOUR
         ).astype(np.uint8)
         return ground
 
@@ -101,19 +101,19 @@ def _draw_people(sheet: Sheet, people: People) -> None:
         xy, way = people.xy[row], ahead[row]
         colour = COLOURS.get(people.ids[row][0], PERSON)
         aside = 0.8 * PERSON_RADIUS_M * np.array([-way[1], way[0]])
-        nose = shapely.Polygon([xy + NOSE_M * way, xy + aside, xy - aside])
+        nose = shapely.Polygon([xy + _NOSE_M * way, xy + aside, xy - aside])
         body = shapely.MultiPolygon([shapely.Point(*xy).buffer(PERSON_RADIUS_M), nose])
         for part in body.geoms:
-            sheet.area(part.buffer(0.09), INK)
+            sheet.area(part.buffer(0.09), _INK)
         sheet.area(body, colour)
         if people.doing[row] == "stop":
-            hand = np.array([xy + (NOSE_M + 0.1) * way + 2.0 * aside, xy + (NOSE_M + 0.1) * way - 2.0 * aside])
-            sheet.line(hand, RED, 0.25)
+            hand = np.array([xy + (_NOSE_M + 0.1) * way + 2.0 * aside, xy + (_NOSE_M + 0.1) * way - 2.0 * aside])
+            sheet.line(hand, RED_SIGNAL, 0.25)
     doing = np.array(people.doing)
     for word in dict.fromkeys(doing[event].tolist()):
         if word not in ("walk", "stand"):
             middle = people.xy[event & (doing == word)].mean(axis=0)
-            sheet.text(middle.tolist(), word, INK, 1.1, 0.38)
+            sheet.text(middle.tolist(), word, _INK, 1.1, 0.38)
 
 
 def _box(xy: Floats, heading_rad: float, size_m: Floats) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, unwritable
 
-MOST_PX = 4096
+_MOST_PX = 4096
 """Longest side of a video."""
 
 
@@ -25,8 +25,8 @@ class Video:
     def __init__(self, path: Path, size: tuple[int, int], fps: int) -> None:
         if path.suffix != ".mp4":
             raise RunError(f"{path}: a video's name ends in .mp4")
-        if any(side % 2 or not 16 <= side <= MOST_PX for side in size):
-            raise RunError(f"a video of {size[0]}x{size[1]} pixels: both sides must be even, from 16 to {MOST_PX}")
+        if any(side % 2 or not 16 <= side <= _MOST_PX for side in size):
+            raise RunError(f"a video of {size[0]}x{size[1]} pixels: both sides must be even, from 16 to {_MOST_PX}")
         self._path, self._part = path, path.with_name(path.name + ".part")
         try:
             self._part.touch()

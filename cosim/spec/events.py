@@ -16,9 +16,11 @@ import msgspec
 from cosim.core.state import PERSON_RADIUS_M, Doing
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
-Kind = Literal["obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"]
+EventName = Literal[
+    "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"
+]
 
-GROUPS: Mapping[Kind, tuple[int, int]] = MappingProxyType(
+GROUPS: Mapping[EventName, tuple[int, int]] = MappingProxyType(
     {
         "obstructing": (1, 1), "conversing": (2, 4), "queueing": (2, 5), "frontal": (1, 1), "lateral": (1, 1),
         "overtaking": (1, 1), "ped_crossing": (1, 4), "gesturing": (1, 1),
@@ -41,7 +43,7 @@ class Event(Ranged, frozen=True, kw_only=True):
     """
 
     id: str
-    kind: Kind
+    kind: EventName
     x_m: Annotated[float, WHERE_M]
     y_m: Annotated[float, WHERE_M]
     heading_rad: Annotated[float, HEADING_RAD]

@@ -14,7 +14,7 @@ import msgspec
 from cosim.core.errors import SpecError
 from cosim.core.state import Doing
 
-FASTEST_MPS = 3.0
+_FASTEST_MPS = 3.0
 LONGEST_S = 3600.0
 
 Name = Annotated[str, msgspec.Meta(pattern="^[A-Za-z0-9_-]{1,32}$")]
@@ -36,9 +36,10 @@ class Injection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     def __post_init__(self) -> None:
         if not all(math.isfinite(value) for point in self.path for value in point):
             raise SpecError(f"pedestrian '{self.id}': path holds a value that is no number")
-        if not 0.0 < self.speed_mps <= FASTEST_MPS:
+        if not 0.0 < self.speed_mps <= _FASTEST_MPS:
             raise SpecError(
-                f"pedestrian '{self.id}': speed_mps must be above 0 and at most {FASTEST_MPS:g}, not {self.speed_mps:g}"
+                f"pedestrian '{self.id}': speed_mps must be above 0 and at most {_FASTEST_MPS:g}, "
+                f"not {self.speed_mps:g}"
             )
         if not 0.0 <= self.stay_s <= LONGEST_S:
             raise SpecError(f"pedestrian '{self.id}': stay_s must be 0 to {LONGEST_S:g}, not {self.stay_s:g}")

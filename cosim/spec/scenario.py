@@ -22,16 +22,16 @@ from cosim.spec.events import Event
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
 from cosim.spec.spec_file import read_spec_file
 
-SCHEMA = 1
+_SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
-SHORTEST_M = 1.0
-LONGEST_M = 20_000.0
+_SHORTEST_M = 1.0
+_LONGEST_M = 20_000.0
 """Of a reference route."""
-SLACK_M = 0.01
+_SLACK_M = 0.01
 EVENT_BEYOND_M = 60.0
 """Who comes towards the robot may start from beyond the goal, so far."""
 SHARE = Within(0, 1, words="must be a share in {range}, not {value}")
-NAME = Text(200)
+_NAME = Text(200)
 FOLDER = Named("a folder")
 
 
@@ -65,7 +65,7 @@ class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
     seed: Annotated[int, SEED]
     size_m: Annotated[float, CITY_SIZE_M] = 2000.0
     style: Annotated[str, Named("a style")] = "mixed"
-    net_hash: Annotated[str, NAME] = ""
+    net_hash: Annotated[str, _NAME] = ""
 
     def contradictions(self) -> Iterator[str]:
         if round(self.size_m, 2) != self.size_m:
@@ -79,9 +79,9 @@ class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
 class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
     """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
 
-    map: Annotated[str, NAME]
+    map: Annotated[str, _NAME]
     seed: Annotated[int, SEED] = 0
-    net_hash: Annotated[str, NAME] = ""
+    net_hash: Annotated[str, _NAME] = ""
 
     @property
     def name(self) -> str:
@@ -101,7 +101,7 @@ class Barrier(Ranged, frozen=True, kw_only=True):
     y_m: Annotated[float, WHERE_M]
     heading_rad: Annotated[float, HEADING_RAD]
     length_m: Annotated[float, Within(0.1, 200)]
-    strip: Annotated[str, NAME]
+    strip: Annotated[str, _NAME]
     end: Literal[0, 1]
     thickness_m: Annotated[float, Within(0.01, 2)] = 0.12
     height_m: Annotated[float, Within(0.1, 5)] = 1.0
@@ -110,7 +110,7 @@ class Barrier(Ranged, frozen=True, kw_only=True):
 class RouteCrossing(Ranged, frozen=True, kw_only=True):
     """A crossing of the reference route, from arc length enter_s_m to leave_s_m."""
 
-    id: Annotated[str, NAME]
+    id: Annotated[str, _NAME]
     enter_s_m: Annotated[float, ALONG_M]
     leave_s_m: Annotated[float, ALONG_M]
     signalised: bool
@@ -198,7 +198,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres."""
 
     id: Annotated[str, FOLDER]
-    suite: Annotated[str, NAME]
+    suite: Annotated[str, _NAME]
     place: Place
     seed: Annotated[int, SEED]
     start: tuple[float, float, float]
@@ -208,21 +208,21 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
     events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
     crowd: CrowdSpec = CrowdSpec()
-    robot: Annotated[str, NAME] = "courier"
+    robot: Annotated[str, _NAME] = "courier"
     goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
     time_limit_s: Annotated[float, Within(0.1, 100_000)] = 300.0
     ends_on_failure: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
     light: Light = Light()
-    schema: int = SCHEMA
+    schema: int = _SCHEMA
 
     @property
     def called(self) -> str:
         return "scenario " if FOLDER.refusal("id", self.id) else f"scenario '{self.id}': "
 
     def contradictions(self) -> Iterator[str]:
-        if self.schema != SCHEMA:
-            yield f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads {SCHEMA}"
+        if self.schema != _SCHEMA:
+            yield f"scenario '{self.id}' has schema {shown(self.schema)}; this version reads {_SCHEMA}"
         if len(self.route) < 2:
             yield f"{self.called}route needs two points or more"
             return
@@ -231,13 +231,13 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
                 yield f"{self.called}{field} {(x, y)} is not the route's end {end}"
         yield HEADING_RAD.refusal(f"{self.called}start's heading", self.start[2])
         length_m = float(np.hypot(*np.diff(self.route, axis=0).T).sum())
-        yield Within(SHORTEST_M, LONGEST_M).refusal(f"{self.called}the length of the route, m,", length_m)
+        yield Within(_SHORTEST_M, _LONGEST_M).refusal(f"{self.called}the length of the route, m,", length_m)
         if length_m <= 2.0 * self.goal_radius_m:
             yield (
                 f"{self.called}goal_radius_m must be less than half of the route's {length_m:g} m, "
                 f"not {self.goal_radius_m}"
             )
-        places = [(crossing.called, "leave_s_m", crossing.leave_s_m, SLACK_M) for crossing in self.crossings]
+        places = [(crossing.called, "leave_s_m", crossing.leave_s_m, _SLACK_M) for crossing in self.crossings]
         places += [(event.called, "route_s_m", event.route_s_m, EVENT_BEYOND_M) for event in self.events]
         for called, field, s_m, beyond_m in places:
             if s_m > length_m + beyond_m:
@@ -262,7 +262,7 @@ class Suite(Ranged, frozen=True, kw_only=True):
     """A named, versioned list of scenarios."""
 
     name: Annotated[str, Named("a suite, and the folder of a run")]
-    version: Annotated[str, NAME]
+    version: Annotated[str, _NAME]
     scenarios: tuple[Scenario, ...]
     description: Annotated[str, Text(10_000)] = ""
 

@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 from cosim.core.errors import EngineError
 from cosim.core.state import LABELS, Frame, RobotState, Street
 from cosim.episode.ports import CameraSpec
-from physics.cameras.canvas import Canvas
+from physics.cameras.canvas import BulletCanvas
 from physics.cameras.eyes import WorldCamera
-from physics.cameras.scene import Scene
-from physics.cameras.view import FAR_M, NEAR_M, Shot
+from physics.cameras.scene import BulletScene
+from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 from physics.world.world import BulletWorld
 
 _HAZE: Final = np.array([206.0, 216.0, 226.0], dtype=np.float32)
@@ -37,13 +37,13 @@ class BulletCamera(WorldCamera):
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, egl: bool = False) -> None:
         super().__init__(world, spec, depth)
         self._egl = egl
-        self._canvas: Canvas | None = None
-        self._scene: Scene | None = None
+        self._canvas: BulletCanvas | None = None
+        self._scene: BulletScene | None = None
 
     def __enter__(self) -> Self:
         if self._canvas is None:
-            self._canvas = Canvas(self._egl)
-            self._scene = Scene(self._canvas, self._world.ground, self._world.barriers, self._world.model)
+            self._canvas = BulletCanvas(self._egl)
+            self._scene = BulletScene(self._canvas, self._world.ground, self._world.barriers, self._world.model)
         return self
 
     def close(self) -> None:
@@ -62,7 +62,9 @@ class BulletCamera(WorldCamera):
         if robot is not None and body:
             _, roll, pitch = self._world.ground.lean(robot.pose, self._world.model)
             self._scene.show_robot(robot.pose, robot.z_m, roll, pitch)
-        rgb, labels, depth = self._canvas.draw(taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_M, FAR_M)
+        rgb, labels, depth = self._canvas.draw(
+            taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_PLANE_M, FAR_PLANE_M
+        )
         nothing = labels == LABELS["sky"]
         sky, below = _sky(taken.size[1], taken.fov_deg, round(taken.steep_rad, 4))
         rgb = _hazy(rgb, depth)

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
+from physics.textures.layers import Colour
 from physics.world.bullet import p
 from physics.world.mesh import Mesh, as_lists
-
-Colour = tuple[float, float, float]
 
 _AWAY: Final = (0.0, 0.0, -200.0)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
@@ -31,7 +30,7 @@ _LIGHT: Final = {
 }
 
 
-class Canvas:
+class BulletCanvas:
     """Coloured, labelled bodies and a renderer of PyBullet's: TinyRenderer, or its EGL plugin, which needs OpenGL.
 
     Physics never pays for them: it runs elsewhere. Raises EngineError when the plugin does not start.
@@ -164,7 +163,7 @@ class Canvas:
 class Rigs:
     """Interchangeable sets of bodies, lent out anew for each picture; what is not lent is out of sight."""
 
-    def __init__(self, canvas: Canvas, meshes: Sequence[Mesh], label: str) -> None:
+    def __init__(self, canvas: BulletCanvas, meshes: Sequence[Mesh], label: str) -> None:
         self._canvas = canvas
         self._shapes = [canvas.shape(mesh) for mesh in meshes]
         self._label = label

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from physics.world.world import BulletWorld
 
 
-def chosen(choice: CameraChoice) -> CameraName:
+def camera_of_choice(choice: CameraChoice) -> CameraName:
     """The camera that a choice comes to here. Raises EngineError when it is `gl` and there is no OpenGL."""
     if choice == "auto":
         return "gl" if context.available() else "bullet"

@@ -13,14 +13,14 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats
 from physics.cameras.clearsky import LUMINANCE
 
-Image = NDArray[np.float32]
+_Image = NDArray[np.float32]
 
 ROWS_MAX = 512
 """Larger pictures are averaged down: a sky is seen blurred."""
 _SPOT_RAD = math.radians(4.0)
 
 
-def read_hdri(path: str) -> Image:
+def read_hdri(path: str) -> _Image:
     """(H, 2H, 3) linear radiance of a Radiance .hdr picture. Raises SpecError naming the file and what is wrong."""
     file = Path(path)
     if not file.is_file():
@@ -47,7 +47,7 @@ def read_hdri(path: str) -> Image:
     return np.ascontiguousarray(rgb)
 
 
-def brightest(picture: Image, ways: Floats) -> tuple[Floats, Floats, Image]:
+def brightest(picture: _Image, ways: Floats) -> tuple[Floats, Floats, _Image]:
     """Direction (3,) of the brightest spot above the horizon, its light (3,) as the radiance of a white surface that
     faces it, and the picture without it: what exceeds the ring around the spot is taken out."""
     rows = len(picture)

@@ -12,15 +12,16 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import People, Street, Vehicles
 from cosim.spec.scenario import Barrier
-from physics.cameras.canvas import Canvas, Colour, Rigs
+from physics.cameras.canvas import BulletCanvas, Rigs
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
 from physics.people.families import FAMILIES
 from physics.people.looks import family_of
-from physics.people.parts import part_colours, part_meshes, placed
+from physics.people.parts import part_colours, part_meshes, placed_parts
 from physics.robots import RobotModel
 from physics.street import props, vehicles
-from physics.street.buildings import FACADES, WINDOWS, facade_meshes
+from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.textures.layers import Colour
 from physics.world.ground import Ground
 from physics.world.tiles import Key, distance_to, keys_within, square, surface
 
@@ -37,13 +38,13 @@ class _TileBodies:
     seen_m: Floats
 
 
-class Scene:
+class BulletScene:
     """Keeps the canvas as the street around a view; what is drawn depends on view and street alone.
 
     built: number of tiles made since the start.
     """
 
-    def __init__(self, canvas: Canvas, ground: Ground, barriers: Sequence[Barrier], model: RobotModel) -> None:
+    def __init__(self, canvas: BulletCanvas, ground: Ground, barriers: Sequence[Barrier], model: RobotModel) -> None:
         self._canvas = canvas
         self._ground = ground
         self._model = model
@@ -60,7 +61,7 @@ class Scene:
         for barrier in barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
-            for mesh, colour in zip(props.barrier_meshes(barrier), (props.RED, props.WHITE), strict=True):
+            for mesh, colour in zip(props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True):
                 body = canvas.add(mesh, colour, "barrier")
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
 
@@ -103,7 +104,7 @@ class Scene:
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
         parts = [(mesh, *surface(name)[::-1]) for name, mesh in self._ground.tile(key).parts.items()]
         for facade, mesh in facade_meshes(self._ground.buildings(key)).items():
-            parts.append((mesh, WINDOWS if facade < 0 else FACADES[facade], "building"))
+            parts.append((mesh, WINDOW_COLOUR if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
         bodies = {
             self._canvas.add(mesh.moved(-middle), colour, label): (at, 0.0)
@@ -122,7 +123,7 @@ class Scene:
 
     def _show_people(self, view: View, who: People, time_s: float) -> None:
         who = who.only(view.rows(who.xy, PERSON_MARGIN_M))
-        parts = placed(who, self._ground.heights(who.xy), time_s)
+        parts = placed_parts(who, self._ground.heights(who.xy), time_s)
         for rigs in self._walkers.values():
             rigs.start()
         for name, at, turn in zip(who.ids, parts.at_m.tolist(), parts.turn.tolist(), strict=True):

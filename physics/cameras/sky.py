@@ -45,7 +45,7 @@ _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
 """Scale of the glow of a city's sky."""
 
-Image = NDArray[np.float32]
+_Image = NDArray[np.float32]
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +60,7 @@ class Sky:
     sun: Floats
     sun_colour: Floats
     ambient: Floats
-    radiance: Image
+    radiance: _Image
     fog_colour: Floats
     fog_per_m: float
     exposure: float

@@ -20,13 +20,13 @@ from physics.world.ground import Ground
 VISIBLE_M: Final = 50.0
 """How far around the eye the ground is drawn, and what stands on it."""
 FORGET_M: Final = 70.0
-NEAR_M: Final = 0.05
-FAR_M: Final = 160.0
+NEAR_PLANE_M: Final = 0.05
+FAR_PLANE_M: Final = 160.0
 PERSON_MARGIN_M: Final = 1.0
 VEHICLE_MARGIN_M: Final = 6.0
 PROP_MARGIN_M: Final = 2.5
 SIDE_MAX: Final = 4096
-FOV_DEG: Final = (5.0, 150.0)
+_FOV_DEG: Final = (5.0, 150.0)
 _MOUNT_M: Final = 3.0
 """No robot carries its camera higher above the ground."""
 
@@ -106,8 +106,8 @@ def check_size(width: int, height: int, fov_deg: float) -> None:
     """Raises UsageError for a picture that nobody can mean."""
     if not (1 <= width <= SIDE_MAX and 1 <= height <= SIDE_MAX):
         raise UsageError(f"a picture of {width} x {height} pixels: each side must be 1 to {SIDE_MAX}")
-    if not FOV_DEG[0] <= fov_deg <= FOV_DEG[1]:
-        raise UsageError(f"a field of view of {fov_deg:g} degrees: it must be {FOV_DEG[0]:g} to {FOV_DEG[1]:g}")
+    if not _FOV_DEG[0] <= fov_deg <= _FOV_DEG[1]:
+        raise UsageError(f"a field of view of {fov_deg:g} degrees: it must be {_FOV_DEG[0]:g} to {_FOV_DEG[1]:g}")
 
 
 def robot_shot(ground: Ground, model: RobotModel, spec: CameraSpec, robot: RobotState) -> Shot:

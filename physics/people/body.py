@@ -13,7 +13,7 @@ from cosim.core.geometry import Floats
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
-from physics.people.figure import LEVELS, MESH_LEVELS, Build, Legs, Sleeve, legs, trunk
+from physics.people.figure import LEVELS, MESH_LEVELS, Build, Legs, Sleeve, legs, torso_pieces
 from physics.people.head import about_head, neck_and_head
 from physics.people.lofts import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
@@ -39,7 +39,7 @@ class Outfit:
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class SkinnedBody:
     """A skinned mesh. vertices, normals (V, 3) in the A pose, x ahead, z up, soles at 0; triangles (T, 3), front
     counter-clockwise; joints (V, 4) uint8 rows and weights (V, 4) float32 that fall and sum to 1; coat (V,) uint8 rows
     of COATS; fat (V,) float32, how much a vertex moves out on stouter people."""
@@ -72,7 +72,7 @@ class FarBody:
 
 
 @lru_cache(maxsize=128)
-def body(outfit: Outfit, level: int) -> Body:
+def body(outfit: Outfit, level: int) -> SkinnedBody:
     """The body at a level of meshes: 0 is full detail."""
     if not 0 <= level < MESH_LEVELS:
         raise ValueError(f"levels of meshes go from 0 to {MESH_LEVELS - 1}: {level}")
@@ -85,7 +85,7 @@ def body(outfit: Outfit, level: int) -> Body:
     vertices = _fitted(vertices, weights, skeleton(outfit.family))
     joints, few = strongest(weights)
     coat = np.repeat([COATS.index(coat) for coat, _ in surfaces], [len(s.vertices) for _, s in surfaces])
-    return Body(
+    return SkinnedBody(
         vertices.astype(np.float32),
         smooth_normals(vertices, triangles).astype(np.float32),
         triangles.astype(np.int32),
@@ -127,7 +127,7 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
 def pieces(outfit: Outfit) -> tuple[Piece, ...]:
     """The closed surfaces of a body."""
     build = outfit.build
-    parts = trunk(build, outfit.loose_m, outfit.legs)
+    parts = torso_pieces(build, outfit.loose_m, outfit.legs)
     if outfit.legs == "skirt":
         parts = parts[:1]
     parts += neck_and_head(build)

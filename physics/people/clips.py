@@ -15,9 +15,9 @@ from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS
 from physics.people.captures import Capture
 from physics.people.families import FAMILIES, Family, skeleton
-from physics.people.gaits import FRAMES as STRIDE_FRAMES
+from physics.people.gaits import CYCLE_FRAMES as STRIDE_FRAMES
 from physics.people.gaits import gait
-from physics.people.gestures import FRAMES as LOOP_FRAMES
+from physics.people.gestures import GESTURE_FRAMES as LOOP_FRAMES
 from physics.people.gestures import GESTURES, LOOP_S, gesture
 from physics.people.skeleton import Skeleton, forward, model_pose, skinning
 

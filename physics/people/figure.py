@@ -34,7 +34,7 @@ class Build:
     head: float = 1.0
 
 
-def trunk(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Piece]:
+def torso_pieces(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Piece]:
     """Shirt, jacket or coat from the hem to the neck, and the seat of the trousers. loose: metres the cloth stands
     off."""
     w, b = build.woman, build.belly_m
@@ -60,7 +60,7 @@ def trunk(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Pie
         wide = man + (woman - man) * w + 0.6 * b * (0.9 < z < 1.2) + loose
         ahead, square = front + loose, 2.5 if z < 1.4 else 2.2
         rings.append(
-            upright((x, 0.0, z), ahead, (behind + loose) / ahead, wide, joints, square, 1.0 if z < 1.3 else 0.5)
+            upright_loft((x, 0.0, z), ahead, (behind + loose) / ahead, wide, joints, square, 1.0 if z < 1.3 else 0.5)
         )
     if kind == "coat":
         rings = [*_tails(build, loose), *rings[1:]]
@@ -70,7 +70,7 @@ def trunk(build: Build, loose: float = 0.0, kind: Legs = "trousers") -> list[Pie
 
 def _rim(hem: Ring, up_m: float, size: float) -> Ring:
     """The ring that closes a hem: a little smaller, above or below it."""
-    return upright(
+    return upright_loft(
         (hem.at[0], 0.0, hem.at[2] + up_m),
         size * hem.ahead[0],
         hem.back,
@@ -90,7 +90,7 @@ def _tails(build: Build, loose: float, hem_m: float = 0.50) -> list[Ring]:
         ahead = 0.112 + 0.052 * flare + loose + 0.6 * b
         wide = 0.166 + 0.014 * w + 0.062 * flare + loose + 0.4 * b
         joints = {"pelvis": 1.0 - share, "left_hip": 0.5 * share, "right_hip": 0.5 * share}
-        rings.append(upright((-0.012, 0.0, z), ahead, 1.12, wide, joints, 2.3, 1.0))
+        rings.append(upright_loft((-0.012, 0.0, z), ahead, 1.12, wide, joints, 2.3, 1.0))
     return rings
 
 
@@ -113,7 +113,7 @@ def _seat(build: Build) -> Piece:
         (1.020, -0.010, 0.098 + 0.9 * b, 0.100, 0.148 - 0.014 * w, {"pelvis": 0.4, "spine1": 0.6}),
     )
     rings = [
-        upright((x, 0.0, z), front, behind / front, wide + 0.5 * b * (z > 0.9), joints, 2.4, 1.0)
+        upright_loft((x, 0.0, z), front, behind / front, wide + 0.5 * b * (z > 0.9), joints, 2.4, 1.0)
         for z, x, front, behind, wide, joints in keys
     ]
     return Piece("bottom", tuple(rings), (28, 18, 0, 0), (11, 6, 0, 0))
@@ -166,14 +166,16 @@ def _leg(
     kept: tuple[int, ...],
 ) -> Piece:
     f = build.limb
-    rings = [upright((x, y * left, z), a * f, 1.0, s * f, joints, 2.15, 0.5) for z, x, y, a, s, joints in keys]
+    rings = [upright_loft((x, y * left, z), a * f, 1.0, s * f, joints, 2.15, 0.5) for z, x, y, a, s, joints in keys]
     return Piece(coat, tuple(rings), LIMB, kept)
 
 
 def _skirt(build: Build, loose: float) -> Piece:
     w, b = build.woman, build.belly_m
     waist = [
-        upright((-0.011, 0.0, z), front + b + loose, 1.03, man - (man - woman) * w + 0.6 * b + loose, joints, 2.4, 1.0)
+        upright_loft(
+            (-0.011, 0.0, z), front + b + loose, 1.03, man - (man - woman) * w + 0.6 * b + loose, joints, 2.4, 1.0
+        )
         for z, front, man, woman, joints in (
             (0.97, 0.118, 0.164, 0.172, {"pelvis": 0.7, "spine1": 0.3}),
             (1.05, 0.114, 0.155, 0.142, {"pelvis": 0.3, "spine1": 0.7}),
@@ -207,7 +209,7 @@ def _shoe(side: str, left: float) -> list[Piece]:
     return [Piece("shoes", tuple(rings), (12, 8, 6, 4), (14, 9, 6, 6))]
 
 
-def upright(
+def upright_loft(
     at: tuple[float, float, float],
     ahead: float,
     back: float,

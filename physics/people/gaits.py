@@ -21,7 +21,7 @@ from physics.people.captures import Capture, capture
 from physics.people.limbs import about_y, about_z, set_leg
 from physics.people.skeleton import INDEX, MIRRORED, Skeleton, axis_angle, rodrigues
 
-FRAMES: Final = 32
+CYCLE_FRAMES: Final = 32
 """Frames in a stride."""
 
 _HARMONICS: Final = 4
@@ -40,7 +40,7 @@ _HEEL_M: Final = (-0.065, -0.095)
 
 
 @dataclass(frozen=True, slots=True)
-class Style:
+class _Style:
     """What a gait takes from its capture. frames in a stride and the frame of the left heel's touch; stride_m there.
 
     stance: share of the stride a foot is down; roll: (phase, degrees the toes are up) of the left foot; lift_m of the
@@ -60,12 +60,12 @@ class Style:
     swing: float
 
 
-_WALK: Final = Style(
+_WALK: Final = _Style(
     "walk", 38, 18.0, 1.45, 0.61,
     ((0.0, 17.0), (0.09, 0.0), (0.30, 0.0), (0.46, -17.0), (0.61, -54.0), (0.70, -48.0), (0.84, 0.0), (0.93, 15.0)),
     0.035, 0.35, 0.058, 1.3, 1.0,
 )  # fmt: skip
-_RUN: Final = Style(
+_RUN: Final = _Style(
     "run", 24, 10.5, 2.3, 0.36,
     ((0.0, 9.0), (0.07, 0.0), (0.15, 0.0), (0.36, -56.0), (0.52, -68.0), (0.72, -25.0), (0.90, 10.0)),
     0.20, 0.30, 0.09, 0.8, 0.75,
@@ -107,7 +107,7 @@ def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0, walk: Capture | 
     for side, left in (("left", 1.0), ("right", -1.0)):
         shoulder = INDEX[f"{side}_shoulder"]
         turns[:, shoulder] = rodrigues([-_CLOSER_RAD * left, 0.0, 0.0]) @ turns[:, shoulder]
-    pelvis = np.zeros((FRAMES, 3))
+    pelvis = np.zeros((CYCLE_FRAMES, 3))
     pelvis[:, 1] = scale * cycle.sway_m
     stance = style.stance + (0.06 * (1.0 - share) if style is _WALK else 0.0)
     feet = {side: _foot(style, side, stride_m, stance, share, scale, skeleton) for side in ("left", "right")}
@@ -118,10 +118,10 @@ def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0, walk: Capture | 
 
 
 def _foot(
-    style: Style, side: str, stride_m: float, stance: float, share: float, scale: float, skeleton: Skeleton
+    style: _Style, side: str, stride_m: float, stance: float, share: float, scale: float, skeleton: Skeleton
 ) -> tuple[Floats, Floats, Floats]:
     """Ankle (FRAMES, 3) metres, turn of the foot (FRAMES, 3, 3), bend of the toes (FRAMES,) rad over a stride."""
-    phase = (np.arange(FRAMES) / FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
+    phase = (np.arange(CYCLE_FRAMES) / CYCLE_FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
     left = 1.0 if side == "left" else -1.0
     warped = np.where(
         phase < stance, phase * style.stance / stance, 1.0 - (1.0 - phase) * (1.0 - style.stance) / (1.0 - stance)
@@ -138,12 +138,12 @@ def _foot(
     ankle_rest = skeleton.rest_m[INDEX[f"{side}_ankle"]]
     ball = skeleton.rest_m[INDEX[f"{side}_foot"]] - ankle_rest
     heel = np.array([_HEEL_M[0] * scale, 0.0, -ankle_rest[2]])
-    out = np.full(FRAMES, left * np.deg2rad(6.0))
+    out = np.full(CYCLE_FRAMES, left * np.deg2rad(6.0))
     foot = about_z(out) @ about_y(-roll)
     flat = about_z(out)
     pivot = np.where(roll[:, None] > 0.0, heel, ball)
     apart_m = scale * (0.050 + 0.035 * (1.0 - min(share, 1.0)) if style is _WALK else 0.030)
-    place = np.column_stack([x, np.full(FRAMES, left * apart_m), ankle_rest[2] + lift])
+    place = np.column_stack([x, np.full(CYCLE_FRAMES, left * apart_m), ankle_rest[2] + lift])
     ankle = place + (flat @ pivot[:, :, None] - foot @ pivot[:, :, None])[:, :, 0]
     relaxed = np.clip(1.0 - swing / 0.35, 0.0, 1.0)
     toe = np.maximum(-roll, 0.0) * np.where(down, 1.0, relaxed)
@@ -151,7 +151,7 @@ def _foot(
 
 
 def _height(
-    style: Style,
+    style: _Style,
     cycle: _Cycle,
     feet: dict[str, tuple[Floats, Floats, Floats]],
     turns: Floats,
@@ -162,9 +162,9 @@ def _height(
 ) -> Floats:
     """(FRAMES,) heights of the pelvis: the capture's bob, as high as the legs reach."""
     bob = style.bounce * cycle.bob_m * scale * share**2
-    room = np.full(FRAMES, np.inf)
+    room = np.full(CYCLE_FRAMES, np.inf)
     for side, (ankle, _, _) in feet.items():
-        phase = (np.arange(FRAMES) / FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
+        phase = (np.arange(CYCLE_FRAMES) / CYCLE_FRAMES + (0.0 if side == "left" else 0.5)) % 1.0
         hip, knee, foot = (INDEX[f"{side}_{part}"] for part in ("hip", "knee", "ankle"))
         rest = skeleton.rest_m
         leg = np.linalg.norm(rest[knee] - rest[hip]) + np.linalg.norm(rest[foot] - rest[knee])
@@ -177,30 +177,30 @@ def _height(
 
 
 @lru_cache(maxsize=4)
-def _cycle(style: Style) -> _Cycle:
+def _cycle(style: _Style) -> _Cycle:
     taken = capture(style.name)
     return _cycle_of(taken, style)
 
 
-def _cycle_of(taken: Capture, style: Style) -> _Cycle:
+def _cycle_of(taken: Capture, style: _Style) -> _Cycle:
     vectors = axis_angle(taken.turns[: style.frames + 1])
     pelvis = taken.pelvis_m[: style.frames + 1]
     curves = np.concatenate([vectors.reshape(len(vectors), -1), pelvis[:, 1:]], axis=1)
     curves = _smooth_loop(curves, style)
-    turns, (sway, bob) = curves[:, :72].reshape(FRAMES, 24, 3), curves[:, 72:].T
-    other = np.roll(turns[:, list(MIRRORED)] * (-1.0, 1.0, -1.0), FRAMES // 2, axis=0)
+    turns, (sway, bob) = curves[:, :72].reshape(CYCLE_FRAMES, 24, 3), curves[:, 72:].T
+    other = np.roll(turns[:, list(MIRRORED)] * (-1.0, 1.0, -1.0), CYCLE_FRAMES // 2, axis=0)
     both = 0.5 * (turns + other)
     mean = both.mean(axis=0)
     change = np.zeros_like(both)
     change[:, list(_UPPER)] = (both - mean)[:, list(_UPPER)]
     kept = np.zeros_like(mean)
     kept[list(_UPPER)] = mean[list(_UPPER)]
-    half = FRAMES // 2
+    half = CYCLE_FRAMES // 2
     bob, sway = 0.5 * (bob + np.roll(bob, half)), 0.5 * (sway - np.roll(sway, half))
     return _Cycle(kept, change, bob - bob.mean(), sway - sway.mean())
 
 
-def _smooth_loop(curves: Floats, style: Style) -> Floats:
+def _smooth_loop(curves: Floats, style: _Style) -> Floats:
     """(FRAMES, C) one stride from the touch of the left heel, as a short Fourier series: a clean loop.
 
     curves: (frames + 1, C) of the capture; what its end misses of its beginning is spread over the stride.
@@ -209,7 +209,7 @@ def _smooth_loop(curves: Floats, style: Style) -> Floats:
     closed = curves[:-1] - (curves[-1] - curves[0]) * (np.arange(frames) / frames - 0.5)[:, None]
     series = np.fft.rfft(closed, axis=0) / frames
     order = np.arange(_HARMONICS + 1)
-    phase = np.arange(FRAMES) / FRAMES + style.touch / frames
+    phase = np.arange(CYCLE_FRAMES) / CYCLE_FRAMES + style.touch / frames
     waves = np.exp(2j * np.pi * phase[:, None] * order) * np.where(order == 0, 1.0, 2.0)
     return np.asarray((waves @ series[: _HARMONICS + 1]).real)
 

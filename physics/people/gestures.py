@@ -16,7 +16,7 @@ from cosim.people.gait import REFERENCE_M
 from physics.people.limbs import about_y, about_z, set_arm, set_leg
 from physics.people.skeleton import INDEX, Skeleton, rodrigues
 
-FRAMES: Final = 64
+GESTURE_FRAMES: Final = 64
 LOOP_S: Final = 8.0
 
 SEAT_M: Final = 0.475
@@ -24,13 +24,13 @@ SEAT_M: Final = 0.475
 SEATED_BACK_M: Final = 0.59
 """Who sits has the hips so far behind the point where it is: that is before the seat, where its legs are."""
 
-_PHASE: Final = 2.0 * np.pi * np.arange(FRAMES) / FRAMES
+_PHASE: Final = 2.0 * np.pi * np.arange(GESTURE_FRAMES) / GESTURE_FRAMES
 
 
 def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
     """The loop called `name`, one of GESTURES: turns (FRAMES, 24, 3, 3) and pelvis (FRAMES, 3) metres."""
     scale = skeleton.height_m / REFERENCE_M
-    bends = np.zeros((FRAMES, 24, 3))
+    bends = np.zeros((GESTURE_FRAMES, 24, 3))
     breath = np.sin(2.0 * _PHASE)
     shift = np.sin(_PHASE + 0.6)
     _bend(bends, "pelvis", 0.025 * shift, 0.03, 0.03 * np.sin(_PHASE))
@@ -43,10 +43,10 @@ def gesture(name: str, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floa
         _bend(bends, f"{side}_collar", -0.03 * left + 0.012 * left * breath, 0.0, 0.0)
     arms = GESTURES[name](bends)
     turns = rodrigues(bends)
-    pelvis = np.column_stack([np.zeros(FRAMES), 0.014 * scale * shift, np.zeros(FRAMES)])
+    pelvis = np.column_stack([np.zeros(GESTURE_FRAMES), 0.014 * scale * shift, np.zeros(GESTURE_FRAMES)])
     pelvis[:, 2] = skeleton.rest_m[0, 2] - (0.004 + 0.004 * shift**2 + 0.03 * max(stoop_rad - 0.1, 0.0)) * scale
     for side, (upper, fore, fingers, thumb) in arms.items():
-        set_arm(turns, side, *(np.broadcast_to(v, (FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
+        set_arm(turns, side, *(np.broadcast_to(v, (GESTURE_FRAMES, 3)) for v in (upper, fore, fingers, thumb)))
     if name == "sit":
         _sit(turns, pelvis, skeleton, scale)
     else:
@@ -59,8 +59,8 @@ def _stand(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> N
     for side, left in (("left", 1.0), ("right", -1.0)):
         ankle = skeleton.rest_m[INDEX[f"{side}_ankle"]]
         place = np.array([ankle[0] + 0.02 * left * scale, left * 0.105 * scale, ankle[2]])
-        foot = about_z(np.full(FRAMES, left * np.deg2rad(9.0))) @ about_y(np.zeros(FRAMES))
-        set_leg(turns, pelvis, side, np.tile(place, (FRAMES, 1)), foot, np.zeros(FRAMES), skeleton)
+        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(9.0))) @ about_y(np.zeros(GESTURE_FRAMES))
+        set_leg(turns, pelvis, side, np.tile(place, (GESTURE_FRAMES, 1)), foot, np.zeros(GESTURE_FRAMES), skeleton)
 
 
 def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> None:
@@ -76,8 +76,8 @@ def _sit(turns: Floats, pelvis: Floats, skeleton: Skeleton, scale: float) -> Non
         fall_m = min(max(hips_m - knee[2], 0.0), 0.8 * thigh_m)
         ahead_m = np.sqrt(thigh_m**2 - fall_m**2) - SEATED_BACK_M + 0.03 * left * scale
         place = np.array([ahead_m, left * 0.125 * scale, ankle[2]])
-        foot = about_z(np.full(FRAMES, left * np.deg2rad(10.0))) @ about_y(np.zeros(FRAMES))
-        set_leg(turns, pelvis, side, np.tile(place, (FRAMES, 1)), foot, np.zeros(FRAMES), skeleton)
+        foot = about_z(np.full(GESTURE_FRAMES, left * np.deg2rad(10.0))) @ about_y(np.zeros(GESTURE_FRAMES))
+        set_leg(turns, pelvis, side, np.tile(place, (GESTURE_FRAMES, 1)), foot, np.zeros(GESTURE_FRAMES), skeleton)
 
 
 def _bend(bends: Floats, joint: str, x: Floats | float, y: Floats | float, z: Floats | float) -> None:
@@ -126,7 +126,7 @@ def _talking(bends: Floats) -> dict[str, Arm]:
     nod = 0.04 * speaks * other + 0.09 * (1.0 - speaks) * np.sin(6.0 * _PHASE)
     _bend(bends, "head", 0.05 * speaks * other, 0.03 + nod, 0.22 * np.sin(2.0 * _PHASE))
     _bend(bends, "spine3", 0.0, 0.0, 0.06 * np.sin(_PHASE))
-    o = np.zeros(FRAMES)
+    o = np.zeros(GESTURE_FRAMES)
     arms: dict[str, Arm] = {}
     for side, left, swing in (("left", 1.0, 0.7 * other), ("right", -1.0, beat)):
         lively = speaks * swing
@@ -154,7 +154,7 @@ def _stopping(bends: Floats) -> dict[str, Arm]:
     _bend(bends, "spine3", 0.0, -0.02, 0.16)
     _bend(bends, "neck", 0.0, 0.02, -0.10)
     _bend(bends, "right_collar", 0.0, 0.0, 0.18)
-    o = np.zeros(FRAMES)
+    o = np.zeros(GESTURE_FRAMES)
     upper = np.column_stack([o + 1.0, o - 0.36, o + 0.02 + push])
     fore = np.column_stack([o + 1.0, o - 0.32, o + 0.05 + push])
     return {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from physics.people.families import man_rest_m
-from physics.people.figure import SMALL, Build, upright
+from physics.people.figure import SMALL, Build, upright_loft
 from physics.people.lofts import Piece, Ring, ball
 from physics.people.skeleton import INDEX
 
@@ -11,10 +11,10 @@ from physics.people.skeleton import INDEX
 def neck_and_head(build: Build) -> list[Piece]:
     """Neck, head with a face, ears."""
     neck = [
-        upright((-0.030, 0.0, 1.455), 0.055, 1.0, 0.058, {"spine3": 0.6, "neck": 0.4}),
-        upright((-0.026, 0.0, 1.500), 0.053, 1.05, 0.055, {"spine3": 0.25, "neck": 0.75}),
-        upright((-0.016, 0.0, 1.540), 0.050, 1.10, 0.052, {"neck": 0.75, "head": 0.25}),
-        upright((-0.006, 0.0, 1.600), 0.050, 1.15, 0.052, {"neck": 0.2, "head": 0.8}),
+        upright_loft((-0.030, 0.0, 1.455), 0.055, 1.0, 0.058, {"spine3": 0.6, "neck": 0.4}),
+        upright_loft((-0.026, 0.0, 1.500), 0.053, 1.05, 0.055, {"spine3": 0.25, "neck": 0.75}),
+        upright_loft((-0.016, 0.0, 1.540), 0.050, 1.10, 0.052, {"neck": 0.75, "head": 0.25}),
+        upright_loft((-0.006, 0.0, 1.600), 0.050, 1.15, 0.052, {"neck": 0.2, "head": 0.8}),
     ]
     slim = 1.0 - 0.05 * build.woman
     profile = (
@@ -32,7 +32,7 @@ def neck_and_head(build: Build) -> list[Piece]:
         (1.752, -0.016, 0.020, 0.026, 0.020, 2.0),
     )
     head = [
-        upright((x, 0.0, z), front, behind / front, wide * slim, {"head": 1.0}, square)
+        upright_loft((x, 0.0, z), front, behind / front, wide * slim, {"head": 1.0}, square)
         for z, x, front, behind, wide, square in profile
     ]
     pieces = [
@@ -58,7 +58,7 @@ def _nose() -> list[Ring]:
         (1.622, 0.090, 0.017, 0.012),
         (1.655, 0.082, 0.010, 0.008),
     )
-    return [upright((x, 0.0, z), deep, 1.0, wide, {"head": 1.0}) for z, x, deep, wide in keys]
+    return [upright_loft((x, 0.0, z), deep, 1.0, wide, {"head": 1.0}) for z, x, deep, wide in keys]
 
 
 def about_head(piece: Piece, factor: float) -> Piece:

@@ -67,7 +67,7 @@ _BOTTOMS: Final = ("26303f", "3f5878", "40392f", "1b1c1e", "6d6353", "8e8878", "
 _SHOES: Final = ("1c1a19", "4b3324", "e6e4df", "35383d", "7a5b3d", "9c2f2a")
 _BAGS: Final = ("3a2a1f", "1f2226", "8c3b2e", "2f5d62", "b08d57", "51437a", "d0b49a", "3d5a36")
 
-Colour = tuple[int, int, int]
+_Colour = tuple[int, int, int]
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,7 @@ def family_of(name: str) -> Family:
 
 
 @lru_cache(maxsize=65536)
-def look(name: str, seed: int = 0) -> Look:
+def look_of(name: str, seed: int = 0) -> Look:
     """The look of the person called `name`; another seed dresses everybody anew, with the same age and stature."""
     family = family_of(name)
     choices = [outfit for outfit in OUTFITS[family] if _fits(outfit, name)]
@@ -114,7 +114,7 @@ def look(name: str, seed: int = 0) -> Look:
     return Look(ALL.index(outfit), table, 0.022 * (_draw(name, seed, "girth") % 1001 / 1000.0) - 0.006)
 
 
-def _hairs(skin: Colour) -> tuple[str, ...]:
+def _hairs(skin: _Colour) -> tuple[str, ...]:
     """Darker skins have darker hair."""
     return _HAIRS if skin[0] > 0xB0 else _HAIRS[:3]
 
@@ -124,7 +124,7 @@ def _fits(outfit: Outfit, name: str) -> bool:
     return outfit.family != "elder" or (outfit.legs == "skirt") == is_woman(name)
 
 
-def _pick(palette: tuple[str, ...], name: str, seed: int, what: str) -> Colour:
+def _pick(palette: tuple[str, ...], name: str, seed: int, what: str) -> _Colour:
     """A colour of a palette, a little lighter or darker."""
     draw = _draw(name, seed, what)
     shade = 0.88 + 0.24 * (draw >> 16 & 0xFF) / 255.0

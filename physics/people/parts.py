@@ -13,14 +13,13 @@ from cosim.core.state import People
 from physics.people.body import COATS
 from physics.people.clips import bind_of, own_clips
 from physics.people.families import Family, skeleton
-from physics.people.looks import ALL, family_of, look
+from physics.people.looks import ALL, family_of, look_of
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, model_pose
+from physics.textures.layers import Colour
 from physics.world.mesh import Mesh, box, frustum, join
 
-Colour = tuple[float, float, float]
-
-PARTS: Final = (
+RIGID_PARTS: Final = (
     ("spine2", "top"),
     ("head", "skin"),
     ("head", "hair"),
@@ -37,11 +36,11 @@ PARTS: Final = (
 )
 """The joint that carries each part, and what it is painted as."""
 
-_CARRIERS: Final = [INDEX[joint] for joint, _ in PARTS]
+_CARRIERS: Final = [INDEX[joint] for joint, _ in RIGID_PARTS]
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
+class _Placed:
     """Where the parts of N people are. at_m: (N, 13, 3) metres; turn: (N, 13, 4) quaternions x, y, z, w."""
 
     at_m: Floats
@@ -109,15 +108,15 @@ def part_meshes(family: Family) -> tuple[Mesh, ...]:
         shoe = box((0.275 * f, 0.09 * f, 0.075 * f), (ankle[0] + 0.075 * f, ankle[1], 0.0375 * f), skip=("bottom",))
         meshes[f"{side}_knee"] = [join([_tube(ankle, knee, (0.05 * f, 0.05 * f), (0.062 * f, 0.06 * f), 5), shoe])]
     taken = {name: iter(list_) for name, list_ in meshes.items()}
-    return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in PARTS)
+    return tuple(next(taken[joint]).moved(-joints[joint]) for joint, _ in RIGID_PARTS)
 
 
-def placed(people: People, z_m: Floats, time_s: float) -> Placed:
+def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:
     """The parts of N people who stand at heights (N,) z_m, in their poses at `time_s`."""
     clips = own_clips()
     posed = poses(people, time_s, clips)
     matrices = posed.matrices(clips)[:, _CARRIERS].astype(float)
-    rest = np.array([_joints(family_of(name)) for name in people.ids]).reshape(len(people), len(PARTS), 3)
+    rest = np.array([_joints(family_of(name)) for name in people.ids]).reshape(len(people), len(RIGID_PARTS), 3)
     turn = matrices[..., :3]
     at = (np.einsum("npab,npb->npa", turn, rest) + matrices[..., 3]) * posed.scale[:, None, None]
     cos, sin = np.cos(people.heading), np.sin(people.heading)
@@ -125,7 +124,7 @@ def placed(people: People, z_m: Floats, time_s: float) -> Placed:
     facing[:, 0, 0, 0], facing[:, 0, 0, 1], facing[:, 0, 1, 0], facing[:, 0, 1, 1] = cos, -sin, sin, cos
     facing[:, 0, 2, 2] = 1.0
     ground = np.column_stack([people.xy, z_m])[:, None]
-    return Placed((facing @ at[..., None])[..., 0] + ground, _quaternions(facing @ turn))
+    return _Placed((facing @ at[..., None])[..., 0] + ground, _quaternions(facing @ turn))
 
 
 @lru_cache(maxsize=4)
@@ -137,12 +136,12 @@ def _joints(family: Family) -> Floats:
 @lru_cache(maxsize=4096)
 def part_colours(name: str) -> tuple[Colour, ...]:
     """The colours of the parts of the person called `name`."""
-    who = look(name)
+    who = look_of(name)
     outfit = ALL[who.outfit]
     red, green, blue = (who.colours / 255.0).T.tolist()
     colours = dict(zip(COATS, zip(red, green, blue, strict=True), strict=True))
     chosen = []
-    for joint, coat in PARTS:
+    for joint, coat in RIGID_PARTS:
         if joint.endswith("knee") and outfit.bare:
             coat = "skin"
         if joint.endswith("elbow") and outfit.sleeve == "short":

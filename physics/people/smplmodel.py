@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats
-from physics.people.body import COATS, Body, smooth_normals, strongest
+from physics.people.body import COATS, SkinnedBody, smooth_normals, strongest
 from physics.people.captures import Capture
 from physics.people.skeleton import INDEX, JOINTS, PARENTS, Skeleton, forward, rodrigues
 
@@ -34,11 +34,11 @@ class SmplBody:
     """A body from a file: its skeleton, and its mesh in the T pose with four weights per vertex."""
 
     skeleton: Skeleton
-    body: Body
+    body: SkinnedBody
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class _Motion:
     """A motion from a file. turns: (F, 24, 3, 3) against the T pose; pelvis_m: (F, 3) from where it was at rest,
     beginning above the origin, heading along x."""
 
@@ -76,7 +76,7 @@ def read_smpl(path: Path, shape: tuple[float, ...] = ()) -> SmplBody:
     return _stood(path, vertices, np.maximum(weights, 0.0), regressor, faces)
 
 
-def read_motion(path: Path) -> Motion:
+def read_motion(path: Path) -> _Motion:
     """An AMASS motion: poses (F, 66 or more), trans (F, 3), mocap_framerate. Raises SpecError naming file and field."""
     arrays = _Arrays.of(path)
     poses = arrays.floats("poses", (None, None))
@@ -100,10 +100,10 @@ def read_motion(path: Path) -> Motion:
     straight = np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]])
     turns[:, 0] = straight @ root
     way = (trans - trans[0] * (1.0, 1.0, 0.0)) @ straight.T
-    return Motion(1.0 / float(rate), turns, way)
+    return _Motion(1.0 / float(rate), turns, way)
 
 
-def stride_of(motion: Motion, body: Skeleton) -> Capture:
+def stride_of(motion: _Motion, body: Skeleton) -> Capture:
     """One stride of a walk, from one touch of the left heel to the next. Raises SpecError when there is none.
 
     The heel touches about when the left ankle is farthest ahead of the right one.
@@ -129,7 +129,7 @@ def _stood(path: Path, vertices: Floats, weights: Floats, regressor: Floats, fac
         raise SpecError(f"{path}: v_template: {highest - lowest:.2f} m tall; a person in metres is 0.3 to 3")
     ours = ours - (0.0, 0.0, lowest)
     joints, few = strongest(weights)
-    made = Body(
+    made = SkinnedBody(
         ours.astype(np.float32),
         smooth_normals(ours, faces.astype(np.int32)).astype(np.float32),
         faces.astype(np.int32),

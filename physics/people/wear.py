@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, Literal
 
 from physics.people.arms import on_arm
-from physics.people.figure import SMALL, upright
+from physics.people.figure import SMALL, upright_loft
 from physics.people.lofts import Joints, Piece, Ring, ball
 
 Hair = Literal["short", "crop", "bob", "long", "bun", "tail"]
@@ -45,7 +45,7 @@ def hair(style: Hair) -> list[Piece]:
             front, wide = front + 0.030, wide + 0.016
         if style == "long" and z < 1.5:
             x, wide = x - 0.022, wide + 0.022
-        rings.append(upright((x, 0.0, top), front, behind / front, wide, joints, 2.1))
+        rings.append(upright_loft((x, 0.0, top), front, behind / front, wide, joints, 2.1))
     pieces = [Piece("hair", tuple(rings), _HAIR, (15, 9, 7, 5))]
     if style == "bun":
         pieces.append(ball("hair", (-0.125, 0.0, 1.700), (0.034, 0.038, 0.036), _HEAD, (10, 7, 6, 4)))
@@ -57,7 +57,7 @@ def hair(style: Hair) -> list[Piece]:
             (1.52, -0.128, 0.028),
             (1.44, -0.122, 0.010),
         )
-        tail = [upright((x, 0.0, z), r, 1.0, 1.15 * r, {"head": 0.8, "neck": 0.2}) for z, x, r in keys]
+        tail = [upright_loft((x, 0.0, z), r, 1.0, 1.15 * r, {"head": 0.8, "neck": 0.2}) for z, x, r in keys]
         pieces.append(Piece("hair", tuple(tail), SMALL, (7, 5, 4, 4)))
     return pieces
 
@@ -72,7 +72,7 @@ def headgear() -> list[Piece]:
         (1.768, -0.018, 0.042, 0.050, 0.0380),
         (1.773, -0.019, 0.016, 0.020, 0.0160),
     )
-    rings = [upright((x, 0.0, z), front, behind / front, wide, _HEAD, 2.1) for z, x, front, behind, wide in dome]
+    rings = [upright_loft((x, 0.0, z), front, behind / front, wide, _HEAD, 2.1) for z, x, front, behind, wide in dome]
     visor = [
         Ring((x, 0.0, z), (0.0, 0.0, 0.005), (0.0, wide, 0.0), _HEAD, 1.0, 2.4)
         for x, z, wide in ((0.060, 1.690, 0.066), (0.100, 1.688, 0.068), (0.140, 1.681, 0.056), (0.165, 1.673, 0.026))
@@ -101,7 +101,7 @@ def _bag() -> Piece:
         (0.955, 0.135, 0.028),
         (0.962, 0.10, 0.018),
     )
-    rings = [upright((-0.01, 0.225, z), deep, 1.0, wide, joints, 3.2) for z, deep, wide in keys]
+    rings = [upright_loft((-0.01, 0.225, z), deep, 1.0, wide, joints, 3.2) for z, deep, wide in keys]
     return Piece("bag", tuple(rings), (14, 12, 6, 4), (6, 6, 5, 4))
 
 
@@ -132,7 +132,7 @@ def _backpack() -> Piece:
         (1.435, 0.040, 0.095),
         (1.44, 0.02, 0.06),
     )
-    rings = [upright((-0.175 + 0.012 * (z > 1.3), 0.0, z), deep, 1.0, wide, joints, 2.8) for z, deep, wide in keys]
+    rings = [upright_loft((-0.175 + 0.012 * (z > 1.3), 0.0, z), deep, 1.0, wide, joints, 2.8) for z, deep, wide in keys]
     return Piece("bag", tuple(rings), (16, 12, 6, 4), (9, 7, 6, 5))
 
 

@@ -21,7 +21,7 @@ from cosim.place.terrain import Terrain
 from physics.world.mesh import Mesh, box, join, quads
 from physics.world.tiles import CURB_M, Key, key_at, square
 
-MARGIN_M: Final = 0.2
+_MARGIN_M: Final = 0.2
 """Least distance of a building from anything walkable or driven on."""
 
 _REACH_M: Final = 40.0
@@ -35,7 +35,7 @@ FACADES: Final = (
     (0.71, 0.45, 0.36), (0.82, 0.74, 0.60), (0.60, 0.62, 0.66),
     (0.76, 0.66, 0.52), (0.55, 0.38, 0.33), (0.84, 0.82, 0.78),
 )  # fmt: skip
-WINDOWS: Final = (0.23, 0.27, 0.33)
+WINDOW_COLOUR: Final = (0.23, 0.27, 0.33)
 
 
 Wall = tuple[float, float, float, float]
@@ -72,7 +72,7 @@ class Building:
         return shapely.Polygon(middle + np.array([along + away, away - along, -along - away, along - away]))
 
 
-class Mapped(Protocol):
+class _Mapped(Protocol):
     """What the map shows of buildings."""
 
     def buildings(self, key: Key) -> tuple[Building, ...]:
@@ -88,7 +88,7 @@ class Frontage:
     mapped: buildings that the map shows; near them none is made up. None: the map shows none.
     """
 
-    def __init__(self, street_map: StreetMap, seed: int, mapped: Mapped | None = None) -> None:
+    def __init__(self, street_map: StreetMap, seed: int, mapped: _Mapped | None = None) -> None:
         self._map = street_map
         self._seed = seed
         self._mapped = mapped
@@ -147,7 +147,7 @@ class Frontage:
         outline = building.polygon
         if self._mapped is not None and self._mapped.shows("building", outline):
             return False
-        area = shapely.buffer(outline, MARGIN_M, join_style="mitre")
+        area = shapely.buffer(outline, _MARGIN_M, join_style="mitre")
         kinds: tuple[PieceKind, ...] = ("strip", "corner", "junction", "lane")
         return not any(p for kind in kinds for p in self._map.near(kind, area) if not _is_verge(p))
 

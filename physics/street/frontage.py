@@ -17,11 +17,11 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import StreetMap, Strip
 from physics.street.mapped import MappedThings
 from physics.street.placement import street_style
+from physics.textures.layers import Colour
 from physics.world.materials import street_of
 from physics.world.mesh import Mesh, join, quads
 from physics.world.tiles import DRIVEWAY_M, Tile, square
 
-Colour = tuple[float, float, float]
 _LIFT_M: Final = 0.003
 _GRID_M: Final = 1e-4
 """Ends of edges nearer to one another than about this are the same."""

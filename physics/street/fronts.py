@@ -13,9 +13,9 @@ from cosim.place.street_map import StreetMap
 from physics.street.buildings import Building
 from physics.street.placement import street_style
 from physics.textures.facade_canvas import BAY_M
-from physics.textures.facades import DOORS, STREETS, VARIANTS, WALL_STYLES, Front, WallStyle
+from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, Front, WallStyle
 
-LEAST_M = 2.2
+NARROWEST_FRONT_M = 2.2
 """A narrower wall has no windows."""
 _DISPLAYS = ("shop-window", "cafe")
 """Bays between the doors of a front that are large windows with something behind them to look at."""
@@ -54,7 +54,7 @@ def face_of(building: Building, style: WallStyle) -> Face:
     """What a building of a style draws by its name."""
     rng = np.random.default_rng(zlib.crc32(building.id.encode()))
     wall, roof, upper = str(rng.choice(style.walls)), str(rng.choice(style.roofs)), str(rng.choice(style.uppers))
-    number = int(rng.integers(VARIANTS))
+    number = int(rng.integers(BAY_VARIANTS))
     front = DOORS[str(rng.choice(style.fronts))]
     first_door = int(rng.integers(front.every))
     tint = style.tints[int(rng.integers(len(style.tints)))] if style.tints else None
@@ -69,7 +69,7 @@ def shop_windows(building: Building, street_map: StreetMap) -> Iterator[ShopWind
         return
     for x0, y0, x1, y1 in building.walls if building.outline is not None else [_street_wall(building)]:
         width = math.hypot(x1 - x0, y1 - y0)
-        if width < LEAST_M:
+        if width < NARROWEST_FRONT_M:
             continue
         count = max(round(width / BAY_M), 1)
         into = math.atan2(x1 - x0, -(y1 - y0))  # the outside is to the right of the wall

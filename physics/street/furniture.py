@@ -12,13 +12,14 @@ import shapely
 from numpy.typing import NDArray
 
 from physics.street import furniture_shapes as shapes
-from physics.street.furniture_shapes import METAL, WOOD, Colour, Part, Size, Solid
+from physics.street.furniture_shapes import METAL, WOOD, Part, Size, Solid
+from physics.textures.layers import Colour
 
 Zone = Literal["verge", "curb", "frontage", "driveway"]
 """Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there is no verge;
 between sidewalk and buildings; in the frontage at the end of a driveway."""
 
-VARIANTS: Final = 3
+PROP_VARIANTS: Final = 3
 """Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a shape."""
 
 LEAVES: Final = ((0.22, 0.42, 0.17), (0.30, 0.48, 0.18), (0.18, 0.36, 0.22), (0.42, 0.46, 0.17))
@@ -35,7 +36,7 @@ PLANTS: Final = ((0.30, 0.46, 0.20), (0.24, 0.40, 0.18), (0.55, 0.34, 0.40), (0.
 
 
 @dataclass(frozen=True, slots=True)
-class Kind:
+class PropKind:
     """An entry of the catalogue.
 
     sizes_m: smallest and largest, of what stands on the ground and is bumped into. per_100m: how many a street of a
@@ -58,7 +59,7 @@ class Kind:
 
     def size_m(self, variant: int) -> Size:
         low, high = np.array(self.sizes_m)
-        length, depth, height = (low + (high - low) * variant / (VARIANTS - 1)).tolist()
+        length, depth, height = (low + (high - low) * variant / (PROP_VARIANTS - 1)).tolist()
         return length, depth, height
 
 
@@ -69,71 +70,71 @@ def _along(residential: float, commercial: float, avenue: float, boulevard: floa
     }  # fmt: skip
 
 
-CATALOGUE: Final[tuple[Kind, ...]] = (
-    Kind(
+CATALOGUE: Final[tuple[PropKind, ...]] = (
+    PropKind(
         "shelter", ((2.8, 1.2, 2.3), (4.0, 1.5, 2.5)), ("verge", "frontage"), _along(0.0, 0.4, 0.7, 0.6, 0.0),
         shapes.three_walls, shapes.shelter, ROOFS, spread_m=0.2, seen_m=50.0,
     ),
-    Kind(
+    PropKind(
         "car", ((3.8, 1.7, 1.45), (4.6, 1.9, 1.45)), ("driveway",), _along(1.0, 0.4, 0.2, 0.2, 0.3),
         shapes.block, shapes.car, CARS, seen_m=50.0,
     ),
-    Kind(
+    PropKind(
         "tree", ((0.2, 0.2, 4.6), (0.4, 0.4, 7.5)), ("verge", "frontage"), _along(5.0, 2.5, 4.5, 7.0, 0.0),
-        shapes.upright, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0, grown=True,
+        shapes.upright_solid, shapes.tree, LEAVES, row=True, spread_m=1.8, seen_m=50.0, grown=True,
     ),
-    Kind(
+    PropKind(
         "lamp", ((0.12, 0.12, 4.5), (0.16, 0.16, 7.0)), ("verge", "curb", "frontage"), _along(3.0, 4.0, 3.6, 3.6, 2.5),
-        shapes.upright, shapes.lamp, (METAL, (0.16, 0.24, 0.20), (0.45, 0.46, 0.47)), row=True, seen_m=50.0,
+        shapes.upright_solid, shapes.lamp, (METAL, (0.16, 0.24, 0.20), (0.45, 0.46, 0.47)), row=True, seen_m=50.0,
     ),
-    Kind(
+    PropKind(
         "fence", ((2.2, 0.4, 1.9), (4.0, 0.4, 2.1)), ("frontage",), _along(0.25, 0.35, 0.3, 0.2, 0.1),
         shapes.block, shapes.fence, FENCES, seen_m=40.0,
     ),
-    Kind(
+    PropKind(
         "cafe", ((1.75, 0.6, 0.85), (1.95, 0.75, 0.85)), ("frontage",), _along(0.1, 3.0, 1.0, 2.0, 0.3),
         shapes.table_and_chairs, shapes.cafe, CHAIRS,
     ),
-    Kind(
+    PropKind(
         "bench", ((1.4, 0.45, 0.85), (1.9, 0.55, 0.9)), ("verge", "frontage"), _along(0.8, 1.6, 1.2, 2.2, 0.1),
-        shapes.block, shapes.bench, (WOOD, (0.40, 0.42, 0.40)),
+        shapes.block, shapes.park_bench, (WOOD, (0.40, 0.42, 0.40)),
     ),
-    Kind(
+    PropKind(
         "rack", ((0.75, 0.6, 0.8), (1.5, 0.75, 0.85)), ("verge", "frontage"), _along(0.4, 1.5, 0.7, 0.9, 0.1),
         shapes.hoops, shapes.rack, ((0.60, 0.62, 0.64), (0.20, 0.22, 0.24)),
     ),
-    Kind(
+    PropKind(
         "planter", ((0.7, 0.35, 0.8), (1.5, 0.5, 1.0)), ("frontage", "verge"), _along(1.5, 2.2, 0.8, 1.8, 1.2),
         shapes.block, shapes.planter, PLANTS,
     ),
-    Kind(
+    PropKind(
         "bin", ((0.42, 0.42, 0.9), (0.56, 0.56, 1.05)), ("verge", "frontage"), _along(1.2, 1.8, 1.0, 1.4, 0.4),
-        shapes.upright, shapes.litter_bin, BINS,
+        shapes.upright_solid, shapes.litter_bin, BINS,
     ),
-    Kind(
+    PropKind(
         "scooter", ((1.15, 0.45, 1.1), (1.2, 0.5, 1.15)), ("verge", "frontage"), _along(0.5, 1.6, 0.8, 0.8, 0.3),
         shapes.block, shapes.scooter, SCOOTERS,
     ),
-    Kind(
+    PropKind(
         "boxes", ((0.7, 0.4, 0.6), (1.3, 0.6, 1.1)), ("frontage",), _along(0.5, 0.9, 0.4, 0.2, 0.5),
         shapes.block, shapes.boxes, CARTONS,
     ),
-    Kind(
+    PropKind(
         "hydrant", ((0.28, 0.28, 0.7), (0.32, 0.32, 0.8)), ("verge", "frontage"), _along(0.7, 0.6, 0.6, 0.6, 0.3),
-        shapes.upright, shapes.hydrant, HYDRANTS,
+        shapes.upright_solid, shapes.hydrant, HYDRANTS,
     ),
-    Kind(
+    PropKind(
         "sign", ((0.06, 0.06, 2.5), (0.08, 0.08, 2.8)), ("verge", "curb"), _along(1.6, 2.2, 2.0, 1.6, 1.6),
-        shapes.upright, shapes.sign, SIGNS, seen_m=40.0,
+        shapes.upright_solid, shapes.sign, SIGNS, seen_m=40.0,
     ),
-    Kind(
+    PropKind(
         "bollard", ((0.12, 0.12, 0.75), (0.18, 0.18, 1.0)), ("verge", "curb"), _along(0.5, 2.0, 0.6, 1.0, 4.0),
-        shapes.upright, shapes.bollard, (METAL, (0.72, 0.60, 0.16)), row=True,
+        shapes.upright_solid, shapes.bollard, (METAL, (0.72, 0.60, 0.16)), row=True,
     ),
 )  # fmt: skip
 """In the order in which they find a place: the large first."""
 
-KINDS: Final[Mapping[str, Kind]] = {kind.name: kind for kind in CATALOGUE}
+KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE}
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,23 +13,23 @@ from typing import Final, Literal
 import numpy as np
 
 from cosim.core.geometry import Floats
-from physics.street.tree_shapes import SPECIES, crown, trunk
+from physics.street.tree_shapes import SPECIES, crown, tree_trunk
 from physics.street.vehicles import vehicle_parts
+from physics.textures.layers import Colour
 from physics.world.mesh import Mesh, box, disc, frustum, join
 
-Colour = tuple[float, float, float]
 Size = tuple[float, float, float]
 """Length along the street, depth across it, height, in metres."""
 
 METAL: Final = (0.24, 0.26, 0.28)
 ZINC: Final = (0.52, 0.53, 0.54)
 WOOD: Final = (0.52, 0.36, 0.22)
-STONE: Final = (0.62, 0.60, 0.57)
+_STONE: Final = (0.62, 0.60, 0.57)
 BARK: Final = (0.36, 0.27, 0.20)
 LIGHT: Final = (0.93, 0.92, 0.85)
 BANDS: Final = (0.90, 0.88, 0.84)
 WHITE: Final = (0.92, 0.92, 0.90)
-DARK: Final = (0.10, 0.10, 0.11)
+_DARK: Final = (0.10, 0.10, 0.11)
 PANE: Final = (0.66, 0.76, 0.80)
 
 
@@ -57,7 +57,7 @@ class Part:
     shade: Floats | None = None
 
 
-def upright(size: Size) -> tuple[Solid, ...]:
+def upright_solid(size: Size) -> tuple[Solid, ...]:
     return (Solid("cylinder", size),)
 
 
@@ -130,10 +130,10 @@ def litter_bin(size: Size) -> tuple[Part, ...]:
         frustum((0.8 * r, 0.8 * r), (0.8 * r, 0.8 * r), 0.8 * h, 0.92 * h, 8),
     ]
     drum = frustum((0.85 * r, 0.85 * r), (0.95 * r, 0.95 * r), 0.08, 0.8 * h, 8)
-    return Part(drum, None, "metal-painted"), Part(join([foot, *lid]), DARK)
+    return Part(drum, None, "metal-painted"), Part(join([foot, *lid]), _DARK)
 
 
-def bench(size: Size) -> tuple[Part, ...]:
+def park_bench(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     slats = [box((length, 0.25 * depth, 0.05), (0.0, y * depth, 0.45), skip=("bottom",)) for y in (-0.35, -0.05, 0.25)]
     slats += [box((length, 0.04, 0.12), (0.0, 0.5 * depth - 0.05, h - z), skip=("bottom",)) for z in (0.06, 0.24)]
@@ -149,7 +149,7 @@ def tree(size: Size, look: int) -> tuple[Part, ...]:
     """look: which species."""
     species = SPECIES[look % len(SPECIES)]
     leaves = crown(species, size[2])
-    stem = trunk(species, size[2], 0.5 * size[0])
+    stem = tree_trunk(species, size[2], 0.5 * size[0])
     return Part(stem, BARK, "bark"), Part(leaves.mesh, None, species.cover, leaves.shade)
 
 
@@ -157,7 +157,7 @@ def planter(size: Size) -> tuple[Part, ...]:
     length, depth, h = size
     tub = box((length, depth, 0.55 * h), (0.0, 0.0, 0.275 * h), skip=("bottom",))
     wide, narrow = (0.46 * length, 0.46 * depth), (0.3 * length, 0.25 * depth)
-    return Part(tub, STONE, "stone"), Part(frustum(wide, narrow, 0.55 * h, h, 8), None, "hedge")
+    return Part(tub, _STONE, "stone"), Part(frustum(wide, narrow, 0.55 * h, h, 8), None, "hedge")
 
 
 def bollard(size: Size) -> tuple[Part, ...]:
@@ -182,7 +182,7 @@ def scooter(size: Size) -> tuple[Part, ...]:
     stem = stem.tilted(-0.1, (front, 0.0, 0.1))
     dark = [box((0.05, depth, 0.04), (front - 0.14, 0.0, h))]
     dark += [box((0.22, 0.06, 0.22), (x, 0.0, 0.11), skip=("bottom", "top")) for x in (front, -front)]
-    return Part(join([box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17)), stem]), None), Part(join(dark), DARK)
+    return Part(join([box((length - 0.4, 0.16, 0.06), (0.0, 0.0, 0.17)), stem]), None), Part(join(dark), _DARK)
 
 
 def cafe(size: Size) -> tuple[Part, ...]:

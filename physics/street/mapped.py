@@ -19,11 +19,11 @@ from cosim.place import overlay
 from cosim.place.street_map import Feature, StreetMap
 from cosim.place.terrain import Terrain
 from physics.street.buildings import FACADES, Building, Wall
-from physics.street.furniture import KINDS, VARIANTS, Prop
+from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
 from physics.world.tiles import Key, key_at, square
 
 HOUSES_M: Final = 30.0
-THINGS_M: Final = 40.0
+MAPPED_NEAR_M: Final = 40.0
 """So near to a building of the map no building is made up, and so near to a thing of the map none of its kind."""
 _SPLINTER_M2: Final = 0.05
 
@@ -73,7 +73,7 @@ class MappedThings:
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
         """Whether the map shows things of a kind near a place, so that none need be made up there."""
         tree = self._trees.get(kind)
-        reach = HOUSES_M if kind == "building" else THINGS_M
+        reach = HOUSES_M if kind == "building" else MAPPED_NEAR_M
         return tree is not None and bool(len(tree.query(place, predicate="dwithin", distance=reach)))
 
 
@@ -81,10 +81,10 @@ def _prop(number: int, feature: Feature) -> Prop:
     """The size nearest to the mapped height, else one drawn by number; the same for the paint."""
     kind = KINDS[feature.kind]
     drawn = zlib.crc32(f"{feature.kind}:{number}".encode())
-    variant = drawn % VARIANTS
+    variant = drawn % PROP_VARIANTS
     if feature.height_m > 0.0:
-        variant = min(range(VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
-    paint = drawn // VARIANTS % len(kind.paints)
+        variant = min(range(PROP_VARIANTS), key=lambda v: abs(kind.size_m(v)[2] - feature.height_m))
+    paint = drawn // PROP_VARIANTS % len(kind.paints)
     turned = number % 7 * 0.9 if kind.grown else 0.0
     return Prop(
         f"prop:map:{number}", feature.kind, variant, feature.x_m, feature.y_m, feature.heading_rad, paint, turned

@@ -20,17 +20,17 @@ from cosim.core.geometry import Polyline
 from cosim.place import overlay
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from physics.street.buildings import Frontage
-from physics.street.furniture import CATALOGUE, KINDS, VARIANTS, Kind, Prop, Zone, footprints
+from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, PropKind, Zone, footprints
 from physics.street.mapped import MappedThings
 from physics.world.tiles import CURBSTONE_M, DRIVEWAY_M, RAMP_M, Key, key_at, square
 
 CLEAR_HALF_M: Final = 0.6
 """The least half width of the band that is kept free along the middle of a sidewalk."""
 
-END_M: Final = 2.0
+PROP_END_GAP_M: Final = 2.0
 """Nothing stands nearer to the end of a sidewalk or to a crossing."""
 
-GAP_M: Final = 0.25
+_GAP_M: Final = 0.25
 """Least distance between two props."""
 
 _EDGE_M: Final = 0.6
@@ -91,7 +91,7 @@ class Placement:
                 others = [s for s in self._map.near("strip", area) if isinstance(s, Strip) and s.id < strip.id]
                 rivals = [polygon for s in others for polygon in self._draw(s)[1]]
                 rivals += list(footprints(self._mapped_in(area)))
-                hit |= _meets(ground, rivals, GAP_M)
+                hit |= _meets(ground, rivals, _GAP_M)
                 spread = np.array([KINDS[prop.kind].spread_m for prop in props])
                 hit |= _meets(shapely.buffer(ground, spread, quad_segs=2), self._houses_in(area), _MARGIN_M)
             self._kept[strip.id] = tuple(prop for prop, is_hit in zip(props, hit, strict=True) if not is_hit)
@@ -128,7 +128,7 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
     """Props for a sidewalk, drawn kind by kind; they may still meet each other or another street."""
     line = Polyline(strip.line if strip.road_side <= 0 else strip.line[::-1])
     bands = zones(strip)
-    usable = line.length_m - 2.0 * END_M
+    usable = line.length_m - 2.0 * PROP_END_GAP_M
     if usable < 1.0 or not bands:
         return
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0x9209])
@@ -140,7 +140,7 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
         fitting = [zone for zone in kind.zones if zone in bands]
         expected = kind.per_100m[style] * busy * usable / 100.0
         count = int(expected + rng.random())
-        variant, paint = int(rng.integers(VARIANTS)), int(rng.integers(len(kind.paints)))
+        variant, paint = int(rng.integers(PROP_VARIANTS)), int(rng.integers(len(kind.paints)))
         aside, phase = rng.random(2)
         if not fitting:
             continue
@@ -153,9 +153,9 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
                 s, share, zone = (k + 0.2 + 0.6 * phase + 0.05 * u) / count * usable, aside, fitting[0]
             else:
                 s, share, zone = u * usable, v, fitting[min(int(w * len(fitting)), len(fitting) - 1)]
-                variant, paint = int(rng.integers(VARIANTS)), int(rng.integers(len(kind.paints)))
+                variant, paint = int(rng.integers(PROP_VARIANTS)), int(rng.integers(len(kind.paints)))
             size = kind.size_m(variant)
-            at_m = driveways[k] if zone == "driveway" else END_M + s
+            at_m = driveways[k] if zone == "driveway" else PROP_END_GAP_M + s
             turned = zone == "driveway" and _room(bands[zone]) > size[0]
             prop = _stood(strip, line, at_m, bands[zone], share, kind, variant, paint, zone, turned, n)
             if prop is None or (zone != "driveway" and any(_blocks(at_m, size[0], d) for d in driveways)):
@@ -165,7 +165,7 @@ def draw(strip: Strip, seed: int) -> Iterable[Prop]:
 
 
 def _stood(
-    strip: Strip, line: Polyline, at_m: float, band: _Band, share: float, kind: Kind, variant: int, paint: int,
+    strip: Strip, line: Polyline, at_m: float, band: _Band, share: float, kind: PropKind, variant: int, paint: int,
     zone: Zone, turned: bool, n: int,
 ) -> Prop | None:  # fmt: skip
     """A prop at an arc length of the line and a share of the free depth of its zone; None when it is too deep."""
@@ -173,7 +173,7 @@ def _stood(
     if turned:
         length, depth = depth, length
     slack = _room(band) - depth
-    if slack < 0.0 or not END_M + 0.5 * length <= at_m <= line.length_m - END_M - 0.5 * length:
+    if slack < 0.0 or not PROP_END_GAP_M + 0.5 * length <= at_m <= line.length_m - PROP_END_GAP_M - 0.5 * length:
         return None
     x, y, along = line.at(at_m)
     away = band.low_m + 0.5 * depth + share * slack
@@ -215,7 +215,7 @@ def street_style(street_class: str) -> str:
     return next((ours for words, ours in _BY_TYPE if any(w in street_class for w in words)), "residential")
 
 
-def standing(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
+def props_of(street_map: StreetMap, seed: int) -> tuple[Prop, ...]:
     """Every prop of a map, sidewalk by sidewalk. Seconds on a large map."""
     mapped = MappedThings(street_map)
     placement = Placement(street_map, seed, Frontage(street_map, seed, mapped), mapped)
@@ -242,19 +242,19 @@ def driveway_ground(strip: Strip) -> list[shapely.Geometry]:
 
 def _fits(street_map: StreetMap, strip: Strip, props: Sequence[Prop], ground: NDArray[np.object_]) -> NDArray[np.bool_]:
     """Which props keep off the clear band, off other streets' ground and off each other, the earlier first."""
-    area = shapely.box(*_grown(shapely.total_bounds(ground), END_M))
+    area = shapely.box(*_grown(shapely.total_bounds(ground), PROP_END_GAP_M))
     taken: list[shapely.Geometry] = []
     for piece in [piece for kind in _STREET for piece in street_map.near(kind, area)]:
         if piece is strip or (isinstance(piece, Lane) and piece.kind == "verge"):
             continue
         is_crossing = isinstance(piece, Strip) and piece.kind == "crossing"
-        taken.append(shapely.buffer(piece.polygon, END_M) if is_crossing else piece.polygon)
+        taken.append(shapely.buffer(piece.polygon, PROP_END_GAP_M) if is_crossing else piece.polygon)
     free = ~_meets(ground, taken, 0.02)
     ways = [way for s in street_map.near("strip", area) if isinstance(s, Strip) for way in driveway_ground(s)]
     free &= ~_meets(ground, ways, 0.0) | np.array([prop.kind == "car" for prop in props])
     half = clear_half_m(strip) if "curb" in zones(strip) else 0.5 * strip.width_m
     free &= np.asarray(shapely.distance(shapely.linestrings(strip.line), ground) >= half)
-    one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=GAP_M)
+    one, two = shapely.STRtree(ground).query(ground, predicate="dwithin", distance=_GAP_M)
     earlier: dict[int, list[int]] = {}
     for i, j in zip(one.tolist(), two.tolist(), strict=True):
         if j < i:

@@ -14,8 +14,8 @@ from cosim.spec.scenario import Barrier
 from physics.world.mesh import Mesh, box, join
 from physics.world.tiles import Key, key_at, square
 
-RED: Final = (0.82, 0.10, 0.09)
-WHITE: Final = (0.93, 0.93, 0.91)
+PROP_RED: Final = (0.82, 0.10, 0.09)
+PROP_WHITE: Final = (0.93, 0.93, 0.91)
 POLE: Final = (0.22, 0.24, 0.25)
 LAMPS: Final = {True: (0.10, 0.85, 0.35), False: (0.95, 0.12, 0.08)}
 """Colour of the lit lamp: may one walk?"""

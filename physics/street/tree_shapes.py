@@ -79,7 +79,7 @@ def crown(species: Species, height_m: float) -> Crown:
     return Crown(Mesh(at, _normals(at, triangles), triangles), shade)
 
 
-def trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
+def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
     """A trunk that flares at its foot and ends within the crown, with three branches."""
     low = clear_m(species, height_m)
     top = low + 0.30 * (height_m - low)

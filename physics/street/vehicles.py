@@ -13,9 +13,9 @@ from typing import Final, Literal, NamedTuple
 
 import numpy as np
 
+from physics.textures.layers import Colour
 from physics.world.mesh import Mesh, box, join, quads
 
-Colour = tuple[float, float, float]
 Shape = Literal["sedan", "hatchback", "estate", "suv", "van", "lorry", "bus", "scooter"]
 
 _PAINTS: Final = (
@@ -36,11 +36,11 @@ _BUS_M: Final = 9.0
 _PROUD_M: Final = 0.012
 """How far panes and lamps stand before the sheet metal."""
 
-Profile = Sequence[tuple[float, float]]
+_Profile = Sequence[tuple[float, float]]
 """(x, z) of a convex outline seen from the right, counter-clockwise; x as a share of the length, z in metres."""
 
 
-class Part(NamedTuple):
+class _Part(NamedTuple):
     """A mesh of one colour; None is the vehicle's paint."""
 
     mesh: Mesh
@@ -50,7 +50,7 @@ class Part(NamedTuple):
 class _Car(NamedTuple):
     """lower: outline of the body; waist: (x, z) of windscreen and rear window at their feet; roof: likewise above."""
 
-    lower: Profile
+    lower: _Profile
     waist: tuple[tuple[float, float], tuple[float, float]]
     roof: tuple[tuple[float, float], tuple[float, float]]
 
@@ -90,7 +90,7 @@ def shape(name: str, length_m: float) -> Shape:
 
 
 @cache
-def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[Part, ...]:
+def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[_Part, ...]:
     """What is drawn of a vehicle of a size."""
     if shape == "scooter":
         return _scooter(length_m, width_m)
@@ -99,7 +99,7 @@ def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[Part, 
     return {"van": _van, "lorry": _lorry, "bus": _bus}[shape](length_m, width_m)
 
 
-def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
+def _car(car: _Car, length_m: float, width_m: float) -> tuple[_Part, ...]:
     half = 0.5 * width_m - 0.03
     lower = _hull([(x * length_m, z) for x, z in car.lower], half, half - 0.04)
     waist, roof = ([(x * length_m, z) for x, z in ends] for ends in (car.waist, car.roof))
@@ -111,16 +111,16 @@ def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
     lamps = [_plate(front, s * (half - 0.26), low - 0.08, 0.34, 0.14) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.20), car.waist[1][1] - 0.22, 0.28, 0.16) for s in (1, -1)]
     return (
-        Part(join([lower, cabin]), None),
-        Part(_panes(waist, roof, half - 0.05, half - 0.20), GLASS),
-        Part(tyres, TYRE),
-        Part(rims, RIM),
-        Part(join(lamps), LAMP),
-        Part(join(rear), REAR_LAMP),
+        _Part(join([lower, cabin]), None),
+        _Part(_panes(waist, roof, half - 0.05, half - 0.20), GLASS),
+        _Part(tyres, TYRE),
+        _Part(rims, RIM),
+        _Part(join(lamps), LAMP),
+        _Part(join(rear), REAR_LAMP),
     )
 
 
-def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
+def _van(length_m: float, width_m: float) -> tuple[_Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     outline = [(-front, 0.35), (front, 0.32), (front, 0.95), (front - 0.9, 1.25), (front - 1.5, 2.25), (-front, 2.3)]
     body = _hull(outline, half, half - 0.10)
@@ -135,7 +135,7 @@ def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
     return _boxy(body, [*side, screen, back], length_m, half, 0.35, 0.8, 1.0)
 
 
-def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
+def _lorry(length_m: float, width_m: float) -> tuple[_Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     cab = [(front - 1.9, 0.5), (front, 0.45), (front, 1.35), (front - 0.25, 2.5), (front - 1.9, 2.5)]
     load = box((length_m - 2.1, 2.0 * half, 2.2), (-1.05, 0.0, 2.0))
@@ -146,10 +146,10 @@ def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
     ]
     screen = _cross_pane((front - 0.02, 1.45), (front - 0.19, 2.25), half - 0.12, half - 0.12)
     parts = _boxy(_hull(cab, half, half - 0.04), [*side, screen], length_m, half, 0.45, 0.75, 0.95)
-    return (*parts, Part(load, LAMP), Part(frame, SKIN))
+    return (*parts, _Part(load, LAMP), _Part(frame, SKIN))
 
 
-def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
+def _bus(length_m: float, width_m: float) -> tuple[_Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     body = box((length_m, 2.0 * half, 2.65), (0.0, 0.0, 1.65))
     count = max(round((length_m - 1.6) / 1.5), 1)
@@ -169,7 +169,7 @@ def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
 
 def _boxy(
     body: Mesh, panes: Sequence[Mesh], length_m: float, half: float, radius_m: float, lamp_m: float, rear_m: float
-) -> tuple[Part, ...]:
+) -> tuple[_Part, ...]:
     """A large vehicle from its body and panes: wheels and lamps are added. lamp_m, rear_m: heights of the lamps."""
     front = 0.5 * length_m
     wheels = [(x, s * (half - 0.12)) for x in (front - 0.22 * length_m, -front + 0.24 * length_m) for s in (1, -1)]
@@ -177,16 +177,16 @@ def _boxy(
     lamps = [_plate(front, s * (half - 0.25), lamp_m, 0.34, 0.18) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.16), rear_m, 0.16, 0.40) for s in (1, -1)]
     return (
-        Part(body, None),
-        Part(join(list(panes)), GLASS),
-        Part(tyres, TYRE),
-        Part(rims, RIM),
-        Part(join(lamps), LAMP),
-        Part(join(rear), REAR_LAMP),
+        _Part(body, None),
+        _Part(join(list(panes)), GLASS),
+        _Part(tyres, TYRE),
+        _Part(rims, RIM),
+        _Part(join(lamps), LAMP),
+        _Part(join(rear), REAR_LAMP),
     )
 
 
-def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
+def _scooter(length_m: float, width_m: float) -> tuple[_Part, ...]:
     """A two-wheeler and its rider, who wears a helmet."""
     front = 0.5 * length_m
     body = _hull([(-0.75 * front, 0.45), (0.3 * front, 0.28), (0.62 * front, 0.95), (-0.8 * front, 0.80)], 0.16, 0.13)
@@ -196,16 +196,16 @@ def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
     helmet = box((0.24, 0.22, 0.26), (0.10, 0.0, 1.62))
     tyres, rims = _wheels([(0.72 * front, 0.05), (-0.72 * front, 0.05)], 0.24, 0.10)
     return (
-        Part(join([body, helmet]), None),
-        Part(join([torso, bar, *legs]), SKIN),
-        Part(tyres, TYRE),
-        Part(rims, RIM),
-        Part(_plate(0.66 * front, 0.0, 0.84, 0.14, 0.12), LAMP),
-        Part(_plate(-0.80 * front, 0.0, 0.70, 0.12, 0.08), REAR_LAMP),
+        _Part(join([body, helmet]), None),
+        _Part(join([torso, bar, *legs]), SKIN),
+        _Part(tyres, TYRE),
+        _Part(rims, RIM),
+        _Part(_plate(0.66 * front, 0.0, 0.84, 0.14, 0.12), LAMP),
+        _Part(_plate(-0.80 * front, 0.0, 0.70, 0.12, 0.08), REAR_LAMP),
     )
 
 
-def _hull(outline: Profile, half_low_m: float, half_high_m: float) -> Mesh:
+def _hull(outline: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
     """A convex outline (x, z) in metres drawn out to both sides, narrower towards its top."""
     z = np.array([p[1] for p in outline])
     share = (z - z.min()) / (z.max() - z.min())
@@ -221,11 +221,11 @@ def _hull(outline: Profile, half_low_m: float, half_high_m: float) -> Mesh:
     return join([strips, Mesh(right, side, fan), Mesh(left, side * (1.0, -1.0, 1.0), fan[:, ::-1].copy())])
 
 
-def _cabin(waist: Profile, roof: Profile, half_low_m: float, half_high_m: float) -> Mesh:
+def _cabin(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
     return _hull([waist[1], waist[0], roof[0], roof[1]], half_low_m, half_high_m)
 
 
-def _panes(waist: Profile, roof: Profile, half_low_m: float, half_high_m: float) -> Mesh:
+def _panes(waist: _Profile, roof: _Profile, half_low_m: float, half_high_m: float) -> Mesh:
     """Windscreen, rear window, and two windows on each side, just before the cabin's sheet metal."""
     foot, head, brow, sill = (
         _towards(waist[k], roof[k], share) for k, share in ((0, 0.06), (0, 0.92), (1, 0.90), (1, 0.14))
@@ -270,7 +270,7 @@ def _cross_pane(
     return quads(np.array([corners]))
 
 
-def _side_pane(outline: Profile, side: int, half_m: float) -> Mesh:
+def _side_pane(outline: _Profile, side: int, half_m: float) -> Mesh:
     """A pane in the left (1) or right (-1) side; its outline (x, z) goes round from the front foot backwards."""
     corners = [(x, side * (half_m + _PROUD_M), z) for x, z in outline]
     return quads(np.array([corners if side > 0 else corners[::-1]]))

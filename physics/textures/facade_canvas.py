@@ -17,10 +17,10 @@ BAY_M: Final = 3.0
 STOREY_M: Final = 3.2
 
 _CODES: Final = encoded(np.arange(4097) / 4096.0)
-Area = tuple[slice, slice]
+_Area = tuple[slice, slice]
 
 
-class Canvas:
+class FacadeCanvas:
     """rgb: (S, S, 3) linear, premultiplied; wall: (S, S) how much of the wall shows; gloss, glow: (S, S).
 
     number: of the variant; what the bays of one front have in common, such as its colour, goes by it.
@@ -55,7 +55,7 @@ class Canvas:
             inner = across[None, full_x.start - columns.start : full_x.stop - columns.start]
             self.fill((z, full_x), share * inner, light)
 
-    def fill(self, area: Area, cover: Field, colour: np.ndarray) -> None:
+    def fill(self, area: _Area, cover: Field, colour: np.ndarray) -> None:
         """Cover an area by (h, w) shares with a linear colour, (3,) or (h, w, 3)."""
         keep = 1.0 - cover
         self.rgb[area] = self.rgb[area] * keep[..., None] + cover[..., None] * colour
@@ -81,7 +81,7 @@ class Canvas:
         self.box(x0, x0 + width, z0, z1, colour)
         self.box(x1 - width, x1, z0, z1, colour)
 
-    def local(self, x0: float, x1: float, z0: float, z1: float) -> tuple[Area, Field, Field, Field]:
+    def local(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field, Field, Field]:
         """An area, how much of each pixel it covers, and x and z in it as shares from 0 to 1, as rows and columns."""
         area, cover = self._cover(x0, x1, z0, z1)
         across = ((self._x[area[1]] - x0) / (x1 - x0))[None, :]
@@ -93,12 +93,12 @@ class Canvas:
         at = (np.clip(self.rgb, 0.0, 1.0) * np.float32(4096.0) + np.float32(0.5)).astype(np.uint16)
         return Picture(np.take(_CODES, at), self.wall, np.stack([self.gloss, self.glow], axis=-1))
 
-    def _cover(self, x0: float, x1: float, z0: float, z1: float) -> tuple[Area, Field]:
+    def _cover(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field]:
         """The pixels of a rectangle, and the share of each that it covers."""
         area, across, up = self._shares(x0, x1, z0, z1)
         return area, up[:, None] * across[None, :]
 
-    def _shares(self, x0: float, x1: float, z0: float, z1: float) -> tuple[Area, Field, Field]:
+    def _shares(self, x0: float, x1: float, z0: float, z1: float) -> tuple[_Area, Field, Field]:
         """The pixels of a rectangle, and the shares of its columns and rows that it covers."""
         px, pz = BAY_M / self.size, STOREY_M / self.size
         columns = slice(max(0, int(np.floor(x0 / px))), min(self.size, int(np.ceil(x1 / px))))

@@ -7,31 +7,31 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, Canvas
+from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
 from physics.textures.fronts import FRONTS
 from physics.textures.layers import Layers, Picture, Recipe, stacked
 from physics.textures.noise import Noise
-from physics.textures.windows import WINDOWS
+from physics.textures.windows import WINDOW_STYLES
 
-VARIANTS: Final = 3
+BAY_VARIANTS: Final = 3
 """Layers of each style of bay, told apart by a number: "sash-0", "sash-1" ..."""
 
 
 @lru_cache(maxsize=4)
 def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
     """Every bay, BAY_M wide and STOREY_M high: upper storeys, then ground floors. 256 pixels are 12 mm each."""
-    styles = {**WINDOWS, **FRONTS}
+    styles = {**WINDOW_STYLES, **FRONTS}
     recipes = {
         f"{name}-{k}": Recipe((BAY_M, STOREY_M), _drawn(style, k))
         for name, style in styles.items()
-        for k in range(VARIANTS)
+        for k in range(BAY_VARIANTS)
     }
     return stacked(recipes, size_px, seed)
 
 
-def _drawn(style: Callable[[Canvas], None], number: int) -> Callable[[Noise], Picture]:
+def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:
     def make(noise: Noise) -> Picture:
-        canvas = Canvas(noise, number)
+        canvas = FacadeCanvas(noise, number)
         style(canvas)
         return canvas.picture()
 

@@ -7,10 +7,10 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, Canvas
+from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
-from physics.textures.panes import WHITE, opening, pane, sill, surround
+from physics.textures.panes import WHITE_FRAME, opening, pane, sill, surround
 
 _FASCIAS: Final[tuple[Colour, ...]] = (
     (0.20, 0.28, 0.27), (0.34, 0.20, 0.19), (0.22, 0.26, 0.35), (0.30, 0.29, 0.27), (0.72, 0.68, 0.60),
@@ -28,7 +28,7 @@ _GOODS: Final[tuple[Colour, ...]] = (
 _PLINTH_M: Final = 0.42
 
 
-def _pick(canvas: Canvas, colours: tuple[Colour, ...]) -> Colour:
+def _pick(canvas: FacadeCanvas, colours: tuple[Colour, ...]) -> Colour:
     return colours[int(canvas.rng.integers(len(colours)))]
 
 
@@ -36,14 +36,14 @@ def _scaled(colour: Colour, by: float) -> Colour:
     return tuple(min(1.0, by * c) for c in colour)  # type: ignore[return-value]
 
 
-def _plinth(canvas: Canvas) -> None:
+def _plinth(canvas: FacadeCanvas) -> None:
     """The foot of the wall: the wall itself, darker, with a ledge; dirt splashed up from the ground."""
     canvas.shade(0.0, BAY_M, 0.0, _PLINTH_M, 0.42)
     canvas.box(0.0, BAY_M, _PLINTH_M - 0.03, _PLINTH_M, (0.60, 0.59, 0.56), 0.5)
     canvas.shade(0.0, BAY_M, 0.0, 0.12, 0.35)
 
 
-def _display(canvas: Canvas, x0: float, x1: float, z0: float, z1: float) -> None:
+def _display(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -> None:
     """A shop window: a warm room, shelves and goods as soft blocks, the street mirrored on it."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
@@ -71,7 +71,7 @@ def _display(canvas: Canvas, x0: float, x1: float, z0: float, z1: float) -> None
     canvas.glow[area] = np.maximum(canvas.glow[area], cover * (0.6 + 0.4 * up))
 
 
-def _fascia(canvas: Canvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
+def _fascia(canvas: FacadeCanvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -> None:
     """A sign board over the whole bay with an abstract mark: bars and a disc, no letters."""
     canvas.box(0.0, BAY_M, z0, z1, colour)
     canvas.box(0.0, BAY_M, z1 - 0.05, z1, _scaled(colour, 1.3))
@@ -87,7 +87,7 @@ def _fascia(canvas: Canvas, colour: Colour, z0: float = 2.55, z1: float = 3.0) -
             x += wide + canvas.rng.choice([0.035, 0.035, 0.12])
 
 
-def _shop(canvas: Canvas, door: bool = True) -> None:
+def _shop(canvas: FacadeCanvas, door: bool = True) -> None:
     colour = _FASCIAS[2 * canvas.number % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 3.0, _scaled(colour, 0.9))
     right = 1.85 if door else BAY_M - 0.1
@@ -106,7 +106,7 @@ def _shop(canvas: Canvas, door: bool = True) -> None:
     canvas.shade(0.0, BAY_M, 0.0, 0.08, 0.4)
 
 
-def _awning(canvas: Canvas, z0: float, z1: float) -> None:
+def _awning(canvas: FacadeCanvas, z0: float, z1: float) -> None:
     """Striped cloth with a straight valance, and its shade on what is below."""
     cloth = _pick(canvas, _CLOTHS)
     pale = (0.78, 0.76, 0.70)
@@ -121,16 +121,16 @@ def _awning(canvas: Canvas, z0: float, z1: float) -> None:
     canvas.shade(0.0, BAY_M, z0 + 0.21 * (z1 - z0), z0 + 0.24 * (z1 - z0), 0.4)
 
 
-def _shop_window(canvas: Canvas) -> None:
+def _shop_window(canvas: FacadeCanvas) -> None:
     _shop(canvas, door=False)
 
 
-def _shop_awning(canvas: Canvas) -> None:
+def _shop_awning(canvas: FacadeCanvas) -> None:
     _shop(canvas, door=False)
     _awning(canvas, 1.98, 2.56)
 
 
-def _cafe(canvas: Canvas, door: bool = False) -> None:
+def _cafe(canvas: FacadeCanvas, door: bool = False) -> None:
     frame = _FASCIAS[(2 * canvas.number + 1) % len(_FASCIAS)]
     canvas.box(0.0, BAY_M, 0.0, 2.9, frame)
     for k in range(3):
@@ -148,11 +148,11 @@ def _cafe(canvas: Canvas, door: bool = False) -> None:
     _fascia(canvas, _scaled(frame, 0.85), 2.62, 3.0)
 
 
-def _cafe_door(canvas: Canvas) -> None:
+def _cafe_door(canvas: FacadeCanvas) -> None:
     _cafe(canvas, door=True)
 
 
-def _entrance(canvas: Canvas) -> None:
+def _entrance(canvas: FacadeCanvas) -> None:
     """The door of a house with flats: leaf, light above it, a step, bells."""
     _plinth(canvas)
     leaf = _pick(canvas, _DOORS)
@@ -173,13 +173,13 @@ def _entrance(canvas: Canvas) -> None:
     canvas.box(x0 - 0.2, x1 + 0.2, 0.0, 0.1, (0.62, 0.61, 0.58))
     canvas.box(2.36, 2.46, 1.25, 1.55, (0.60, 0.59, 0.56))
     if canvas.rng.random() < 0.6:
-        opening(canvas, 0.12, 0.6, 1.3, 2.3, WHITE)
+        opening(canvas, 0.12, 0.6, 1.3, 2.3, WHITE_FRAME)
 
 
-def _home(canvas: Canvas) -> None:
+def _home(canvas: FacadeCanvas) -> None:
     _plinth(canvas)
     x0, x1 = 0.85, 2.15
-    opening(canvas, x0, x1, 1.0, 2.5, WHITE, (2, 1))
+    opening(canvas, x0, x1, 1.0, 2.5, WHITE_FRAME, (2, 1))
     sill(canvas, x0, x1, 1.0)
     if canvas.rng.random() < 0.25:
         for x in np.arange(x0 + 0.1, x1, 0.13):
@@ -187,7 +187,7 @@ def _home(canvas: Canvas) -> None:
         canvas.box(x0, x1, 1.7, 1.72, (0.14, 0.14, 0.15))
 
 
-def _garage(canvas: Canvas) -> None:
+def _garage(canvas: FacadeCanvas) -> None:
     _plinth(canvas)
     colour = _pick(canvas, ((0.62, 0.62, 0.61), (0.40, 0.42, 0.44), (0.46, 0.38, 0.30), (0.70, 0.69, 0.65)))
     canvas.box(0.22, 2.78, 0.0, 2.5, (0.22, 0.22, 0.22))
@@ -198,7 +198,7 @@ def _garage(canvas: Canvas) -> None:
     canvas.shade(0.22, 2.78, 2.1, 2.5, 0.55, 0.4)
 
 
-def _lobby(canvas: Canvas) -> None:
+def _lobby(canvas: FacadeCanvas) -> None:
     """Glass from the floor up, in steel."""
     canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.30, 0.31, 0.32))
     for k in range(2):
@@ -211,7 +211,7 @@ def _lobby(canvas: Canvas) -> None:
     canvas.box(0.0, BAY_M, 3.05, STOREY_M, (0.42, 0.43, 0.44))
 
 
-def _blank(canvas: Canvas) -> None:
+def _blank(canvas: FacadeCanvas) -> None:
     _plinth(canvas)
     if canvas.rng.random() < 0.5:
         canvas.box(2.2, 2.7, 0.5, 1.1, (0.55, 0.55, 0.54))
@@ -222,7 +222,7 @@ def _blank(canvas: Canvas) -> None:
         canvas.box(0.32, 0.34, 0.0, STOREY_M, (0.66, 0.67, 0.67))
 
 
-FRONTS: Final[Mapping[str, Callable[[Canvas], None]]] = {
+FRONTS: Final[Mapping[str, Callable[[FacadeCanvas], None]]] = {
     "shop": _shop,
     "shop-window": _shop_window,
     "shop-awning": _shop_awning,

@@ -26,7 +26,7 @@ _DARK: Final = (0.36, 0.35, 0.34)
 @lru_cache(maxsize=4)
 def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Every layer of ground. size_px: 256 suits a laptop."""
-    return stacked(GROUND, size_px, seed)
+    return stacked(GROUND_RECIPES, size_px, seed)
 
 
 def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False) -> Generator:
@@ -184,7 +184,7 @@ def _cast(noise: Noise) -> Picture:
     return Picture(shaded(rgb, 1.0 - 0.32 * cracks(noise, cells(noise, 3), 0.003)), whole.alpha)
 
 
-GROUND: Final[Mapping[str, Recipe]] = {
+GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
     "asphalt": Recipe(3.0, _asphalt(0.050)),
     "asphalt-worn": Recipe(4.0, _asphalt(0.055, 0.37, worn=1.0)),
     "asphalt-patched": Recipe(6.0, _asphalt(0.050, 0.35, worn=0.6, patches=True)),

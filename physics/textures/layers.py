@@ -97,7 +97,7 @@ def stacked(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
     return Layers(tuple(recipes), rgba, metres, mean, finish)
 
 
-def joined(*stacks: Layers) -> Layers:
+def joined_layers(*stacks: Layers) -> Layers:
     """Several stacks of one size as one; names must differ, finishes are not kept."""
     names = tuple(name for stack in stacks for name in stack.names)
     if len(set(names)) != len(names) or len({stack.rgba.shape[1] for stack in stacks}) != 1:

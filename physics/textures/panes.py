@@ -6,11 +6,11 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import Canvas
+from physics.textures.facade_canvas import FacadeCanvas
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import Field, step
 
-WHITE: Final = (0.84, 0.83, 0.80)
+WHITE_FRAME: Final = (0.84, 0.83, 0.80)
 BROWN: Final = (0.37, 0.28, 0.21)
 DARK: Final = (0.23, 0.24, 0.26)
 GREEN: Final = (0.29, 0.36, 0.32)
@@ -21,7 +21,7 @@ LIT_SHARE: Final = 0.4
 """Share of rooms with a light on at night."""
 
 
-def pane(canvas: Canvas, x0: float, x1: float, z0: float, z1: float, dress: bool = True) -> None:
+def pane(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float, dress: bool = True) -> None:
     """Glass: a dark room, a reflection of sky over roofs, perhaps curtains or a blind; some are lit at night."""
     rng = canvas.rng
     area, cover, across, up = canvas.local(x0, x1, z0, z1)
@@ -58,7 +58,7 @@ def pane(canvas: Canvas, x0: float, x1: float, z0: float, z1: float, dress: bool
 
 
 def opening(
-    canvas: Canvas,
+    canvas: FacadeCanvas,
     x0: float,
     x1: float,
     z0: float,
@@ -84,19 +84,21 @@ def opening(
     canvas.shade(x0, x0 + 0.05, z0, z1, 0.25)
 
 
-def sill(canvas: Canvas, x0: float, x1: float, z: float, colour: Colour = STONE) -> None:
+def sill(canvas: FacadeCanvas, x0: float, x1: float, z: float, colour: Colour = STONE) -> None:
     canvas.box(x0 - 0.08, x1 + 0.08, z - 0.07, z, colour)
     canvas.box(x0 - 0.08, x1 + 0.08, z - 0.012, z, tuple(min(1.0, 1.1 * c) for c in colour))  # type: ignore[arg-type]
     canvas.shade(x0 - 0.06, x1 + 0.06, z - 0.22, z - 0.07, 0.45, 0.15)
 
 
-def surround(canvas: Canvas, x0: float, x1: float, z0: float, z1: float, colour: Colour, width: float = 0.13) -> None:
+def surround(
+    canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float, colour: Colour, width: float = 0.13
+) -> None:
     """A raised border around an opening, with the shadow it throws."""
     canvas.shade(x0 - width, x1 + width + 0.03, z0, z1 + width, 0.35)
     canvas.frame(x0 - width, x1 + width, z0, z1 + width, width, colour, head=1.03)
 
 
-def railing(canvas: Canvas, x0: float, x1: float, z0: float, z1: float) -> None:
+def railing(canvas: FacadeCanvas, x0: float, x1: float, z0: float, z1: float) -> None:
     for x in np.arange(x0 + 0.05, x1, 0.11):
         canvas.box(float(x) - 0.008, float(x) + 0.008, z0, z1, IRON)
     canvas.box(x0, x1, z1 - 0.04, z1, IRON)

@@ -7,12 +7,12 @@ from typing import Final
 
 import numpy as np
 
-from physics.textures.facade_canvas import BAY_M, STOREY_M, Canvas
+from physics.textures.facade_canvas import BAY_M, STOREY_M, FacadeCanvas
 from physics.textures.layers import Colour, linear
 from physics.textures.noise import step
-from physics.textures.panes import BROWN, DARK, GREEN, STONE, WHITE, opening, pane, railing, sill, surround
+from physics.textures.panes import BROWN, DARK, GREEN, STONE, WHITE_FRAME, opening, pane, railing, sill, surround
 
-Style = Callable[[Canvas], None]
+_Style = Callable[[FacadeCanvas], None]
 
 _COURSE: Final = (0.66, 0.64, 0.60)
 
@@ -21,15 +21,15 @@ def _middle(width: float) -> tuple[float, float]:
     return 0.5 * (BAY_M - width), 0.5 * (BAY_M + width)
 
 
-def _string_course(canvas: Canvas) -> None:
+def _string_course(canvas: FacadeCanvas) -> None:
     """A moulded band along the floor of the storey."""
     canvas.box(0.0, BAY_M, 0.0, 0.13, _COURSE)
     canvas.shade(0.0, BAY_M, 0.0, 0.05, 0.35)
     canvas.box(0.0, BAY_M, 0.11, 0.13, (0.76, 0.74, 0.70))
 
 
-def _sash(frame: Colour, bars: int) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _sash(frame: Colour, bars: int) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         x0, x1 = _middle(1.05)
         canvas.box(x0 - 0.12, x1 + 0.12, 2.55, 2.77, STONE)
         canvas.shade(x0 - 0.1, x1 + 0.1, 2.47, 2.55, 0.3, 0.08)
@@ -42,8 +42,8 @@ def _sash(frame: Colour, bars: int) -> Style:
     return draw
 
 
-def _casement(frame: Colour) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _casement(frame: Colour) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         _string_course(canvas)
         x0, x1 = _middle(1.2)
         surround(canvas, x0, x1, 0.85, 2.6, STONE)
@@ -54,10 +54,10 @@ def _casement(frame: Colour) -> Style:
     return draw
 
 
-def _shutters(colour: Colour) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _shutters(colour: Colour) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         x0, x1 = _middle(1.1)
-        opening(canvas, x0, x1, 0.85, 2.5, WHITE, (2, 3))
+        opening(canvas, x0, x1, 0.85, 2.5, WHITE_FRAME, (2, 3))
         sill(canvas, x0, x1, 0.85)
         for a, b in ((x0 - 0.58, x0 - 0.03), (x1 + 0.03, x1 + 0.58)):
             canvas.shade(a, b + 0.05, 0.80, 2.5, 0.35)
@@ -70,8 +70,8 @@ def _shutters(colour: Colour) -> Style:
     return draw
 
 
-def _french(frame: Colour) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _french(frame: Colour) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         x0, x1 = _middle(1.35)
         surround(canvas, x0, x1, 0.1, 2.55, STONE, 0.09)
         opening(canvas, x0, x1, 0.1, 2.55, frame, (2, 1))
@@ -81,8 +81,8 @@ def _french(frame: Colour) -> Style:
     return draw
 
 
-def _pair(frame: Colour) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _pair(frame: Colour) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         for x in (0.85, 2.15):
             opening(canvas, x - 0.42, x + 0.42, 0.9, 2.5, frame, (1, 2))
             sill(canvas, x - 0.42, x + 0.42, 0.9)
@@ -90,8 +90,8 @@ def _pair(frame: Colour) -> Style:
     return draw
 
 
-def _square(frame: Colour, width: float, panes: int) -> Style:
-    def draw(canvas: Canvas) -> None:
+def _square(frame: Colour, width: float, panes: int) -> _Style:
+    def draw(canvas: FacadeCanvas) -> None:
         x0, x1 = _middle(width)
         opening(canvas, x0, x1, 0.85, 2.48, frame, (panes, 1), 0.10)
         sill(canvas, x0, x1, 0.85, (0.56, 0.57, 0.57))
@@ -99,11 +99,11 @@ def _square(frame: Colour, width: float, panes: int) -> Style:
     return draw
 
 
-def _arched(canvas: Canvas) -> None:
+def _arched(canvas: FacadeCanvas) -> None:
     """A segmental arch of voussoirs over a window with a straight head set back in it."""
     x0, x1 = _middle(1.1)
     _string_course(canvas)
-    opening(canvas, x0, x1, 0.85, 2.5, WHITE, (2, 2))
+    opening(canvas, x0, x1, 0.85, 2.5, WHITE_FRAME, (2, 2))
     area, _, across, up = canvas.local(x0 - 0.25, x1 + 0.25, 2.25, 2.8)
     x, z = (across - 0.5) * (x1 - x0 + 0.5), up * 0.55
     # The circle through the springers at z 0.1 and the crown at z 0.3 of this area.
@@ -117,10 +117,10 @@ def _arched(canvas: Canvas) -> None:
     sill(canvas, x0, x1, 0.85)
 
 
-def _balcony(front: Colour | None, frame: Colour) -> Style:
+def _balcony(front: Colour | None, frame: Colour) -> _Style:
     """A balcony with a solid front, or a railing; its door and window lie in the shade behind it."""
 
-    def draw(canvas: Canvas) -> None:
+    def draw(canvas: FacadeCanvas) -> None:
         opening(canvas, 0.35, 2.65, 0.12, 2.5, frame, (3, 1), 0.12)
         canvas.shade(0.15, 2.85, 1.9, 3.0, 0.45, 0.9)
         if front is not None:
@@ -137,7 +137,7 @@ def _balcony(front: Colour | None, frame: Colour) -> Style:
     return draw
 
 
-def _ribbon(canvas: Canvas) -> None:
+def _ribbon(canvas: FacadeCanvas) -> None:
     """Glass from edge to edge; bays side by side make one band."""
     canvas.box(0.0, BAY_M, 0.95, 2.6, DARK)
     for k in range(2):
@@ -146,10 +146,10 @@ def _ribbon(canvas: Canvas) -> None:
     canvas.box(0.0, BAY_M, 0.90, 0.96, (0.50, 0.51, 0.52))
 
 
-def _office(spandrel: Colour) -> Style:
+def _office(spandrel: Colour) -> _Style:
     """Curtain wall: panes above an opaque breast, upright fins."""
 
-    def draw(canvas: Canvas) -> None:
+    def draw(canvas: FacadeCanvas) -> None:
         canvas.box(0.0, BAY_M, 0.0, STOREY_M, (0.24, 0.25, 0.27))
         for k in range(2):
             pane(canvas, k * 1.5 + 0.04, k * 1.5 + 1.46, 0.85, 3.1)
@@ -160,7 +160,7 @@ def _office(spandrel: Colour) -> Style:
     return draw
 
 
-def _blank(canvas: Canvas) -> None:
+def _blank(canvas: FacadeCanvas) -> None:
     """No window; perhaps a grille."""
     if canvas.rng.random() < 0.5:
         canvas.box(1.3, 1.7, 2.3, 2.6, (0.40, 0.40, 0.41))
@@ -168,22 +168,22 @@ def _blank(canvas: Canvas) -> None:
             canvas.shade(1.32, 1.68, float(z), float(z) + 0.025, 0.5)
 
 
-WINDOWS: Final[Mapping[str, Style]] = {
-    "sash": _sash(WHITE, 2),
-    "sash-fine": _sash(WHITE, 3),
-    "casement": _casement(WHITE),
+WINDOW_STYLES: Final[Mapping[str, _Style]] = {
+    "sash": _sash(WHITE_FRAME, 2),
+    "sash-fine": _sash(WHITE_FRAME, 3),
+    "casement": _casement(WHITE_FRAME),
     "casement-brown": _casement(BROWN),
     "shutters": _shutters((0.29, 0.36, 0.32)),
     "shutters-brown": _shutters((0.42, 0.32, 0.26)),
-    "french": _french(WHITE),
+    "french": _french(WHITE_FRAME),
     "french-dark": _french(DARK),
-    "pair": _pair(WHITE),
+    "pair": _pair(WHITE_FRAME),
     "pair-green": _pair(GREEN),
     "square": _square(DARK, 1.6, 2),
-    "square-white": _square(WHITE, 1.4, 2),
+    "square-white": _square(WHITE_FRAME, 1.4, 2),
     "wide": _square(DARK, 2.2, 3),
     "arched": _arched,
-    "balcony": _balcony((0.64, 0.63, 0.60), WHITE),
+    "balcony": _balcony((0.64, 0.63, 0.60), WHITE_FRAME),
     "balcony-railed": _balcony(None, DARK),
     "ribbon": _ribbon,
     "office": _office((0.36, 0.39, 0.41)),

@@ -34,7 +34,7 @@ _TYRE: Final = {
 """Soft tyres share the load evenly and slide more easily sideways (y is the axle): without both, and with the
 friction cone, skid turns come in jerks."""
 
-Kind = Literal["pedestrian", "vehicle", "wall", "object"]
+BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
 Moving = Literal["pedestrian", "vehicle"]
 
 
@@ -46,7 +46,7 @@ class Bodies:
         if self._client < 0:
             raise EngineError("PyBullet did not start")
         self._model = model
-        self._what: dict[int, tuple[Kind, str]] = {}
+        self._what: dict[int, tuple[BodyKind, str]] = {}
         self._pools: dict[Any, list[int]] = {}
         self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
         self._z: dict[Moving, list[float]] = {"pedestrian": [], "vehicle": []}
@@ -237,7 +237,7 @@ class Bodies:
         h = self._model.com_height_m
         return (x - h * m[2], y - h * m[5], z - h * m[8]), m
 
-    def robot_contacts(self) -> set[tuple[Kind, str]]:
+    def robot_contacts(self) -> set[tuple[BodyKind, str]]:
         """Everything but the ground that the robot touches now."""
         points = p.getContactPoints(bodyA=self._robot, physicsClientId=self._client)
         return {self._what[c[2]] for c in points if c[2] in self._what and c[8] <= 0.0}

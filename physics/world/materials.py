@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Lane, StreetMap, Strip
+from physics.textures.layers import Colour
 
-Colour = tuple[float, float, float]
 PLAIN_FRICTION: Final = 0.9
 
 

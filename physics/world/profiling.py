@@ -7,10 +7,10 @@ from typing import Any
 
 from physics.world.bullet import p
 
-Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
+_Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
 
 
-def put_stopwatch(timed: Timed) -> None:
+def put_physics_stopwatch(timed: _Timed) -> None:
     """Replace PyBullet's step and picture by timed ones, for the rest of this process."""
     p.stepSimulation = timed("physics", p.stepSimulation)
     p.getCameraImage = timed("camera", p.getCameraImage)

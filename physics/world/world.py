@@ -14,7 +14,7 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
-from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, frozen
+from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, write_protected
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import Barrier
 from physics.robots import robot as robot_model
@@ -124,7 +124,7 @@ class BulletWorld:
             found += [Contact(kind, other, k) for kind, other in bodies.robot_contacts()]
         found += self._overlaps(trace, people.ids, people_poses, cars.ids, car_poses, car_half)
         contacts = tuple(sorted(set(found), key=lambda c: (c.substep, c.kind, c.other)))
-        return Motion(bodies.robot_state(), frozen(trace), contacts)
+        return Motion(bodies.robot_state(), write_protected(trace), contacts)
 
     def _overlaps(
         self,

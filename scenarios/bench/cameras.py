@@ -84,7 +84,7 @@ def _cars(x_m: float, y_m: float, heading_rad: float) -> Callable[[float], Vehic
     return at
 
 
-def place_of(size_m: float) -> StreetMap:
+def camera_city(size_m: float) -> StreetMap:
     """The street map of the city of a size that pictures are taken in."""
     from sumo_nets.city.store import city_net
     from sumo_nets.net.snapshot import street_map_of
@@ -97,7 +97,7 @@ def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) ->
     from physics.cameras.choice import camera_of
     from scenarios.execution.wiring import world_of
 
-    street_map = place_of(size_m)
+    street_map = camera_city(size_m)
     world = world_of(street_map, 5)
     busy = busy_street(street_map, persons, frames)
     with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
@@ -108,7 +108,7 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
     """Median seconds of a picture of nothing but people: posed, skinned, drawn, and read back while the next is."""
     from physics.cameras.gl.alone import PeopleAlone
 
-    busy = busy_street(place_of(size_m), persons, frames)
+    busy = busy_street(camera_city(size_m), persons, frames)
     with PeopleAlone(SIZE, 60.0) as eyes:
 
         def draw(street: Street) -> None:
@@ -124,7 +124,7 @@ def together(environments: int, frames: int, size_m: float) -> float:
     from physics.cameras.gl.atlas import Atlas
     from scenarios.execution.wiring import world_of
 
-    street_map = place_of(size_m)
+    street_map = camera_city(size_m)
     world = world_of(street_map, 5)
     busy = busy_street(street_map, PERSONS, frames)
     spec = CameraSpec(*SIZE, fov_deg=60.0)
@@ -160,14 +160,14 @@ WHOLE: Final = "whole frame, gl"
 PEOPLE: Final = "people alone, gl"
 TINY: Final = "whole frame, bullet (TinyRenderer)"
 EGL: Final = "whole frame, bullet (EGL plugin)"
-SMALL: Final = "whole frame, gl, 0.2 km city"
+_SMALL: Final = "whole frame, gl, 0.2 km city"
 
 FIGURES: Final = (
     Figure(WHOLE, partial(whole_frame, "gl", PERSONS, 120), least_fps=(100.0, 1000.0)),
     Figure(PEOPLE, partial(people_alone, PERSONS, 200), least_fps=(PAPER_FPS, 10.0 * PAPER_FPS)),
     Figure(TINY, partial(whole_frame, "bullet", PERSONS, 20)),
     Figure(EGL, partial(whole_frame, "bullet-egl", PERSONS, 20)),
-    Figure(SMALL, partial(whole_frame, "gl", PERSONS, 120), 200.0),
+    Figure(_SMALL, partial(whole_frame, "gl", PERSONS, 120), 200.0),
     Figure(f"whole frame, gl, {CROWDED} people", partial(whole_frame, "gl", CROWDED, 60), least_fps=(None, 500.0)),
     Figure(f"{TOGETHER} environments in an atlas, gl", partial(together, TOGETHER, 40), least_fps=(None, 5000.0)),
 )
@@ -176,23 +176,23 @@ FIGURES: Final = (
 RATIOS: Final = (
     ("gl / TinyRenderer", WHOLE, TINY, ">= 5"),
     ("gl / EGL plugin", WHOLE, EGL, ">= 5"),
-    ("time in a 2 km city / 0.2 km city", SMALL, WHOLE, "<= 1.1"),
+    ("time in a 2 km city / 0.2 km city", _SMALL, WHOLE, "<= 1.1"),
 )
 """What a ratio says, the figures above and below its line, what it should be."""
 
 
-class Found(NamedTuple):
+class _Found(NamedTuple):
     """What came out of a figure: frames a second, round by round; why: what is wrong where there are none."""
 
     fps: list[float]
     why: str = ""
 
 
-def measure(rounds: int, tell: Callable[[str], None], figures: Sequence[Figure] = FIGURES) -> dict[str, Found]:
+def time_cameras(rounds: int, tell: Callable[[str], None], figures: Sequence[Figure] = FIGURES) -> dict[str, _Found]:
     """Frames a second of every figure, `rounds` times, each in a fresh process. What fails is not tried again."""
     from scenarios.bench.speed import alone
 
-    found = {figure.name: Found([]) for figure in figures}
+    found = {figure.name: _Found([]) for figure in figures}
     for i in range(rounds):
         for figure in figures:
             if found[figure.name].why:
@@ -201,7 +201,7 @@ def measure(rounds: int, tell: Callable[[str], None], figures: Sequence[Figure] 
             try:
                 found[figure.name].fps.append(1.0 / alone(figure.work, figure.size_m))
             except CosimError as error:
-                found[figure.name] = Found([], str(error))
+                found[figure.name] = _Found([], str(error))
             except Exception as error:  # noqa: BLE001  a library or a driver may fail in any way; it is told
-                found[figure.name] = Found([], f"{type(error).__name__}: {error}")
+                found[figure.name] = _Found([], f"{type(error).__name__}: {error}")
     return found

@@ -20,7 +20,7 @@ from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.episode.driver import Driver
 from cosim.episode.step import Step
-from cosim.judge.referee import STANDING_MPS, Verdict
+from cosim.judge.referee import ROBOT_STANDS_MPS, Verdict
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.spec.scenario import City, Scenario
@@ -31,7 +31,7 @@ from scenarios.execution.run import Outcome, run_episode
 from scenarios.execution.shepherd import end_with
 from sumo_nets.crowd.stoplines import StopLines
 
-SIZE_M = 2000.0
+_SIZE_M = 2000.0
 """Of the cities, whose seeds count from 1."""
 
 
@@ -66,7 +66,7 @@ def cross_all(crossings: int, cities: int, policy: str, jobs: int, tell: Callabl
     found: list[Crossed] = []
 
     def one(seed: int, count: int) -> None:
-        for crossed in cross_city(City(seed=seed, size_m=SIZE_M), count, policy):
+        for crossed in cross_city(City(seed=seed, size_m=_SIZE_M), count, policy):
             found.append(crossed)
             tell(f"{len(found)} of {crossings} crossings")
 
@@ -86,7 +86,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
     names, done = [""] * count, 0
     try:
         with ProcessPoolExecutor(1, context, initializer=end_with, initargs=(os.getpid(),)) as alone:
-            scenarios = alone.submit(drawn, city, count).result()
+            scenarios = alone.submit(_drawn, city, count).result()
             names = [scenario.id for scenario in scenarios]
             for scenario in scenarios:
                 yield alone.submit(cross, scenario, policy).result()
@@ -96,7 +96,7 @@ def cross_city(city: City, count: int, policy: str) -> Iterator[Crossed]:
             yield Crossed(scenario=name, city=city.name, crossing="", ended="crashed", reason="the process died")
 
 
-def drawn(city: City, count: int) -> list[Scenario]:
+def _drawn(city: City, count: int) -> list[Scenario]:
     """So many crossings of a city."""
     _, street_map = place(city)
     return build_all(city, street_map, WalkGraph(street_map), 0, count)
@@ -135,7 +135,7 @@ def told(scenario: Scenario, outcome: Outcome, tally: Tally) -> Crossed:
     )
     if log is None:
         return nothing
-    stood = log.waits_at_red & (np.abs(log.speed[:, 0]) < STANDING_MPS)
+    stood = log.waits_at_red & (np.abs(log.speed[:, 0]) < ROBOT_STANDS_MPS)
     return msgspec.structs.replace(
         nothing,
         ended=str(record.ended),

@@ -20,7 +20,7 @@ from shapely.geometry import LineString, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose, wrap_angle
-from cosim.core.state import Command, Motion, RobotState, Street, frozen
+from cosim.core.state import Command, Motion, RobotState, Street, write_protected
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.place.street_map import StreetMap
@@ -33,10 +33,10 @@ from physics.world.ground import Ground
 from physics.world.tiles import key_at
 from scenarios.bench.crowd_tally import Tally
 from scenarios.bench.group_tally import widest_gaps
-from scenarios.builders.long_horizon import build
+from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
-from scenarios.execution.wiring import Stage
+from scenarios.execution.wiring import StagedScenario
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.stoplines import StopLines
 
@@ -84,7 +84,7 @@ class Glider:
             x_m + way_m * math.cos(middle), y_m + way_m * math.sin(middle), wrap_angle(heading + command.w_radps * dt_s)
         )
         self._robot = RobotState(pose, command.v_mps, command.w_radps)
-        return Motion(self._robot, frozen([pose] * substeps))
+        return Motion(self._robot, write_protected([pose] * substeps))
 
 
 def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
@@ -97,9 +97,11 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
     ticks, persons, crowd_s, seed = 0, 0, 0.0, 0
     wanted = clock.ticks(60.0 * minutes)
     while ticks < wanted:
-        scenario = msgspec.structs.replace(build(city, street_map, graph, seed, f"crowd-{seed}"), crowd=crowd)
+        scenario = msgspec.structs.replace(
+            build_long_horizon(city, street_map, graph, seed, f"crowd-{seed}"), crowd=crowd
+        )
         seed += 1
-        tally, done, shown, spent_s = drive(scenario, street_map, wanted - ticks, gaps_m)
+        tally, done, shown, spent_s = _drive(scenario, street_map, wanted - ticks, gaps_m)
         counts.append(tally.counts)
         crossings |= tally.crossings
         ticks, persons, crowd_s = ticks + done, persons + shown, crowd_s + spent_s
@@ -114,7 +116,7 @@ def watch(city: City, minutes: float, crowd: CrowdSpec) -> Watched:
     )
 
 
-def drive(
+def _drive(
     scenario: Scenario, street_map: StreetMap, limit_ticks: int, gaps_m: list[float]
 ) -> tuple[Tally, int, int, float]:
     """Drive one route. Returns what was counted, the ticks, the sum of persons shown, the crowd's CPU seconds.
@@ -127,7 +129,7 @@ def drive(
     timed: Stopwatch
     persons = 0
 
-    def gliding(stage: Stage) -> None:
+    def gliding(stage: StagedScenario) -> None:
         nonlocal crowd, timed
         crowd = cast(SumoCrowd, stage.parts.crowd)
         timed = Stopwatch(crowd)

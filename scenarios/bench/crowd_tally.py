@@ -30,7 +30,7 @@ OVERLAP_M: Final = 0.3
 ENTERING_S: Final = 3.0
 """So long after somebody has appeared it counts as entering."""
 
-NARROW_M: Final = 2.5
+_NARROW_M: Final = 2.5
 """A sidewalk narrower than this counts as narrow."""
 
 EVERY_TICKS: Final = 5
@@ -131,7 +131,7 @@ class Tally:
             return "off the sidewalks"
         if strip.kind == "crossing":
             return "on crossings"
-        return "on narrow sidewalks" if strip.width_m < NARROW_M else "on sidewalks"
+        return "on narrow sidewalks" if strip.width_m < _NARROW_M else "on sidewalks"
 
     def _penetrations(self, people: People, vehicles: Vehicles) -> None:
         seconds = self._tick_s * EVERY_TICKS

@@ -32,13 +32,13 @@ from scenarios.execution.wiring import crowd_of
 BODIES = 3
 """The robot and two event pedestrians."""
 
-STEP_M = 0.075
+_STEP_M = 0.075
 """How far a body goes in a tick: 1.5 m/s."""
 
 MOVES = {"walk": 0.2, "lane": 0.2, "across": 0.3, "stand": 0.15, "jump": 0.15}
 """What a body does next, and how often."""
 
-WALK_EDGES = 6
+_WALK_EDGES = 6
 ACROSS_M = (10.0, 60.0)
 STAND_TICKS = 160
 NEARBY_M = 100.0
@@ -145,7 +145,7 @@ def wandering(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator)
                 yield pose
             continue
         path = Polyline(line)
-        for s_m in np.arange(0.0, path.length_m, STEP_M):
+        for s_m in np.arange(0.0, path.length_m, _STEP_M):
             pose = path.at(float(s_m))
             yield pose
 
@@ -162,7 +162,7 @@ def _walk(street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, pos
     here = street_map.locate(pose.x_m, pose.y_m).edge
     names = list(strips)
     first = here if here in strips else names[int(rng.integers(len(names)))]
-    walk = graph.wander(rng, first, bool(rng.random() < 0.5), WALK_EDGES)
+    walk = graph.wander(rng, first, bool(rng.random() < 0.5), _WALK_EDGES)
     pieces = [strips[first].line[:, :2]]
     for name in walk[1:]:
         line = strips[name].line[:, :2]

@@ -29,13 +29,13 @@ from cosim.spec.scenario import City, CrowdSpec, Scenario
 
 if TYPE_CHECKING:
     from scenarios.execution.scorer import Scorer
-    from scenarios.execution.wiring import Stage
+    from scenarios.execution.wiring import StagedScenario
 
 MEASURED_S = 60.0
-WARM_UP_S = 5.0
+_WARM_UP_S = 5.0
 ASKED = 500
 """Questions about a place whose mean time is taken."""
-PARTS = ("crowd", "physics", "camera", "policy", "bridge", "referee", "loop")
+TIMED_PARTS = ("crowd", "physics", "camera", "policy", "bridge", "referee", "loop")
 
 
 class FourHertz(Route):
@@ -60,7 +60,7 @@ class Spent(defaultdict[str, float]):
         return run
 
 
-class Timed:
+class _Timed:
     """An engine behind its port, with a stopwatch on one method."""
 
     def __init__(self, engine: object, method: str, part: str, spent: Spent) -> None:
@@ -85,16 +85,16 @@ class Drive(NamedTuple):
 def scenario_in(size_m: float) -> Scenario:
     """A long-horizon scenario with 50 persons and 20 vehicles in a city of a size."""
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.long_horizon import build
+    from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
 
     city = City(seed=5, size_m=size_m)
     _, street_map = place(city)
-    whole = build(city, street_map, WalkGraph(street_map), 7, "bench")
+    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 7, "bench")
     return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=50, radius_m=80.0, vehicles=20))
 
 
-def drive(size_m: float) -> Drive:
+def _drive(size_m: float) -> Drive:
     """Drive for MEASURED_S simulated seconds in a city of a size."""
     import physics.world.profiling
     import sumo_nets.crowd.profiling
@@ -102,25 +102,25 @@ def drive(size_m: float) -> Drive:
     from scenarios.execution.episode import Episode
 
     scenario, spent, engine = scenario_in(size_m), Spent(float), Spent(float)
-    physics.world.profiling.put_stopwatch(engine.timed)
-    sumo_nets.crowd.profiling.put_stopwatch(engine.timed)
+    physics.world.profiling.put_physics_stopwatch(engine.timed)
+    sumo_nets.crowd.profiling.put_crowd_stopwatch(engine.timed)
     policy = FourHertz()
 
-    def timed(stage: Stage) -> None:
+    def timed(stage: StagedScenario) -> None:
         parts = stage.parts
         stage.parts = Parts(
-            cast(World, Timed(parts.world, "step", "physics", spent)),
-            cast(Crowd, Timed(parts.crowd, "step", "crowd", spent)),
-            cast(Director, Timed(parts.director, "react", "bridge", spent)),
-            cast(Camera, Timed(parts.camera, "render", "camera", spent)),
+            cast(World, _Timed(parts.world, "step", "physics", spent)),
+            cast(Crowd, _Timed(parts.crowd, "step", "crowd", spent)),
+            cast(Director, _Timed(parts.director, "react", "bridge", spent)),
+            cast(Camera, _Timed(parts.camera, "render", "camera", spent)),
         )
-        stage.scorer = cast("Scorer", Timed(stage.scorer, "score", "referee", spent))
+        stage.scorer = cast("Scorer", _Timed(stage.scorer, "score", "referee", spent))
 
     with Episode(scenario, policy.manifest, through=timed) as episode:
         act = spent.timed("policy", policy.act)
         policy.reset(scenario.id, scenario.seed)
         observation = episode.reset()
-        warm, last = episode.clock.ticks(WARM_UP_S), episode.clock.ticks(WARM_UP_S + MEASURED_S)
+        warm, last = episode.clock.ticks(_WARM_UP_S), episode.clock.ticks(_WARM_UP_S + MEASURED_S)
         while episode.moment.tick < warm:
             observation = episode.advance(act(observation))
         spent.clear()
@@ -218,13 +218,13 @@ class Report(NamedTuple):
         return [small.factor / big.factor for big, small in zip(self.big, self.small, strict=True)]
 
 
-def measure(rounds: int, tell: Callable[[str], None]) -> Report:
+def time_episodes(rounds: int, tell: Callable[[str], None]) -> Report:
     """Take every figure `rounds` times, each in a fresh process."""
     report = Report([], [], [], [])
     for i in range(rounds):
         tell(f"round {i + 1} of {rounds}")
-        report.big.append(alone(drive, 2000.0))
-        report.small.append(alone(drive, 500.0))
+        report.big.append(alone(_drive, 2000.0))
+        report.small.append(alone(_drive, 500.0))
         report.first_frame_s.append(alone(first_frame, 2000.0))
         report.places.append(alone(places, 2000.0))
     return report

@@ -16,16 +16,16 @@ from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
 from scenarios.bench.speed import Spent, alone, scenario_in
 
-PERSONS: Final = (50, 150)
+_PERSONS: Final = (50, 150)
 VEHICLES: Final = 20
 MEASURED_TICKS: Final = 1200
 WARM_UP_TICKS: Final = 100
 PACE_MPS: Final = 1.0
-AHEAD_M: Final = 6.0
+_AHEAD_M: Final = 6.0
 """The event pedestrians walk abreast this far before the robot."""
 
 CAST: Final = 4
-ABREAST_M: Final = 0.7
+_ABREAST_M: Final = 0.7
 
 
 class StreetStep(NamedTuple):
@@ -36,11 +36,11 @@ class StreetStep(NamedTuple):
     shown: float
 
 
-def measure(rounds: int, tell: Callable[[str], None]) -> dict[int, list[StreetStep]]:
+def time_street(rounds: int, tell: Callable[[str], None]) -> dict[int, list[StreetStep]]:
     """Each of PERSONS `rounds` times, every time in a fresh process."""
-    found: dict[int, list[StreetStep]] = {persons: [] for persons in PERSONS}
+    found: dict[int, list[StreetStep]] = {persons: [] for persons in _PERSONS}
     for k in range(rounds):
-        for persons in PERSONS:
+        for persons in _PERSONS:
             tell(f"street of {persons} persons, round {k + 1} of {rounds}")
             found[persons].append(alone(street_step, persons))
     return found
@@ -54,7 +54,7 @@ def street_step(persons: int) -> StreetStep:
     inside = Spent(float)
     scenario = msgspec.structs.replace(scenario_in(2000.0), crowd=CrowdSpec(persons=persons, vehicles=VEHICLES))
     line = scenario.route_line
-    sumo_nets.crowd.profiling.put_stopwatch(inside.timed)
+    sumo_nets.crowd.profiling.put_crowd_stopwatch(inside.timed)
     spent_s = shown = 0.0
     with crowd_of(scenario) as crowd:
         for tick in range(WARM_UP_TICKS + MEASURED_TICKS):
@@ -62,7 +62,7 @@ def street_step(persons: int) -> StreetStep:
                 inside.clear()
                 spent_s = shown = 0.0
             way_m = PACE_MPS * Clock().tick_s * tick
-            reply = EventReply(episode="", tick=tick, states=(), actors=cast(line.at(way_m + AHEAD_M)))
+            reply = EventReply(episode="", tick=tick, states=(), actors=cast(line.at(way_m + _AHEAD_M)))
             began = time.perf_counter()
             street = crowd.step(RobotState(line.at(way_m), PACE_MPS), reply)
             spent_s += time.perf_counter() - began
@@ -83,5 +83,5 @@ def cast(middle: Pose) -> tuple[Actor, ...]:
             speed_mps=PACE_MPS,
             doing="walk",
         )
-        for k, left_m in enumerate(ABREAST_M * (n - (CAST - 1) / 2) for n in range(CAST))
+        for k, left_m in enumerate(_ABREAST_M * (n - (CAST - 1) / 2) for n in range(CAST))
     )

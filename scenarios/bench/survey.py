@@ -13,8 +13,8 @@ from cosim.core.errors import EngineError
 from cosim.spec.scenario import City
 from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import footprints
-from physics.street.placement import standing
-from sumo_nets.city.census import CLEAR_M, Census, census
+from physics.street.placement import props_of
+from sumo_nets.city.census import LEAST_CLEAR_M, Census, census
 from sumo_nets.city.store import city_net
 from sumo_nets.net.snapshot import street_map_of
 
@@ -35,13 +35,13 @@ def survey(city: City) -> Survey:
     """Count and measure a city on its final geometry."""
     net = city_net(city)
     place = street_map_of(net)
-    props = standing(place, city.seed)
+    props = props_of(place, city.seed)
     found = census(net, place, list(footprints(props)))
     sidewalks = [strip for strip in place.strips.values() if strip.kind == "sidewalk"]
     widths = clear_width(sidewalks, props)
     tightest = min(widths, key=lambda strip: widths[strip][0])
     faults = list(found.faults)
-    if (side_m := widths[tightest][0]) < CLEAR_M:
+    if (side_m := widths[tightest][0]) < LEAST_CLEAR_M:
         faults.append(f"sidewalk {tightest} is only {side_m:.2f} m wide beside what stands on it")
     if blocked := on_driveways(sidewalks, props):
         faults.append(f"{len(blocked)} props stand on driveways: {', '.join(blocked[:3])}")

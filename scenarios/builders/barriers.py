@@ -26,7 +26,7 @@ SEAM_HOLE_M2 = 0.25
 MOUTH_M = 4.0
 """How far before and behind a strip's end the edge of a slanting corner is looked for."""
 
-REACH_M = 30.0
+_REACH_M = 30.0
 """The walkable area is examined this far around the way; what can be reached must end before."""
 
 
@@ -160,7 +160,7 @@ def ground_around(
 ) -> tuple[shapely.Geometry, Polygon | MultiPolygon]:
     """The area within REACH_M of a way, and the walkable ground there."""
     strips = union_closed([street_map.strips[port.strip].polygon for port in way])
-    surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), REACH_M)
+    surroundings = shapely.buffer(overlay.union(strips, LineString(route.points)), _REACH_M)
     return surroundings, street_map.walkable_near(surroundings)
 
 

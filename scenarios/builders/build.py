@@ -51,7 +51,7 @@ class Candidates(NamedTuple):
     draw: Callable[[int], Scenario]
 
 
-class Recipe(NamedTuple):
+class _Recipe(NamedTuple):
     """How a suite is made. candidates: scenario by scenario, those of one place together: a place is read once."""
 
     version: str
@@ -68,7 +68,9 @@ def long_horizon_candidates() -> Iterator[Candidates]:
         graph = WalkGraph(street_map)
         for number in range(PER_CITY):
             name = f"lh-{seed:03d}-{number:02d}"
-            yield Candidates(name, number, partial(long_horizon.build, city, street_map, graph, scenario_id=name))
+            yield Candidates(
+                name, number, partial(long_horizon.build_long_horizon, city, street_map, graph, scenario_id=name)
+            )
 
 
 def reactive_candidates() -> Iterator[Candidates]:
@@ -78,18 +80,20 @@ def reactive_candidates() -> Iterator[Candidates]:
         graph = WalkGraph(street_map)
         for kind in GROUPS:
             name = f"{kind}-{city.seed:03d}"
-            yield Candidates(name, number, partial(reactive.build, kind, city, street_map, graph, scenario_id=name))
+            yield Candidates(
+                name, number, partial(reactive.build_reactive, kind, city, street_map, graph, scenario_id=name)
+            )
 
 
-RECIPES: Mapping[str, Recipe] = MappingProxyType(
+RECIPES: Mapping[str, _Recipe] = MappingProxyType(
     {
-        "long-horizon": Recipe(
+        "long-horizon": _Recipe(
             version="0.2",
             description="Start and goal more than 100 m apart in generated cities; one walkable path; street life.",
             expert="route",
             candidates=long_horizon_candidates,
         ),
-        "reactive": Recipe(
+        "reactive": _Recipe(
             version="0.1",
             description="10 to 20 m of way with one event of pedestrians on it, each event in the same cities.",
             expert="orca",
@@ -120,7 +124,7 @@ def proof_of(scenario: Scenario, record: Record, expert: str) -> Proof:
     )  # fmt: skip
 
 
-def main(name: str, out: Path) -> None:
+def build_suite(name: str, out: Path) -> None:
     """Build a suite at `out`, its proofs beside it."""
     if name not in RECIPES:
         raise unknown("suite", name, RECIPES)
@@ -141,4 +145,4 @@ def main(name: str, out: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], Path(sys.argv[2]))
+    build_suite(sys.argv[1], Path(sys.argv[2]))

@@ -12,14 +12,14 @@ from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import Place, Scenario
-from scenarios.builders.drawing import Refusals, along
+from scenarios.builders.drawing import Refusals, events_along
 from scenarios.builders.long_horizon import on_road_m, route_crossings
 
-BEFORE_M: Final = 10.0
+START_BEFORE_CROSSING_M: Final = 10.0
 AFTER_M: Final = 8.0
 """From the start to the crossing, and from it to the goal, along the way."""
 OFF_ROAD_M: Final = 1.0
-LIMIT_S: Final = 180.0
+_LIMIT_S: Final = 180.0
 """Longer than a cycle of any signal, with time to walk."""
 
 
@@ -51,17 +51,17 @@ def build_all(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, 
 
 def _over(place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, seed: int, scenario_id: str) -> Scenario:
     """The way over one crossing, entered at a port. Raises CosimError where there is none."""
-    way = [_beside(street_map, graph, enter, BEFORE_M), enter, enter.other]
+    way = [_beside(street_map, graph, enter, START_BEFORE_CROSSING_M), enter, enter.other]
     way.append(_beside(street_map, graph, enter.other, AFTER_M))
     # Corners are part of the way: the line begins far enough back and is cut where it has the right length.
-    line = way_line(street_map, way, BEFORE_M, AFTER_M)
+    line = way_line(street_map, way, START_BEFORE_CROSSING_M, AFTER_M)
     (crossing,) = route_crossings(street_map, line, way[1:])
-    from_m, to_m = crossing.enter_s_m - BEFORE_M, crossing.leave_s_m + AFTER_M
+    from_m, to_m = crossing.enter_s_m - START_BEFORE_CROSSING_M, crossing.leave_s_m + AFTER_M
     route = Polyline(np.round([line.at(s).xy for s in np.linspace(from_m, to_m, round(to_m - from_m) + 1)], 3))
     crossings = route_crossings(street_map, route, way[1:])
     if on_road_m(street_map, route, crossings) > OFF_ROAD_M:
         raise MapError("the way lies on a road")
-    return along(
+    return events_along(
         route,
         crossings,
         place,
@@ -69,7 +69,7 @@ def _over(place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, se
         suite="crossings",
         seed=seed,
         scenario_id=scenario_id,
-        time_limit_s=LIMIT_S,
+        time_limit_s=_LIMIT_S,
     )
 
 

@@ -57,7 +57,7 @@ def first_of(draws: Iterable[Callable[[], Scenario]], refusals: Refusals) -> Sce
     return None
 
 
-def along(
+def events_along(
     route: Polyline,
     crossings: tuple[RouteCrossing, ...],
     place: Place,

@@ -23,10 +23,10 @@ from scenarios.execution.places import place
 from sumo_nets.crowd.room import Room
 
 LOOKING: Final = "looking where the episodes take place"
-AROUND_M: Final = 3.0
+_AROUND_M: Final = 3.0
 """So much of a place is looked at around routes and events."""
-SAMPLE_M: Final = 0.5
-EDGE_M: Final = 0.02
+_SAMPLE_M: Final = 0.5
+_EDGE_M: Final = 0.02
 """Nearer than this to the edge of the walkable area is on it."""
 BESIDE_STRIP_M: Final = 8.0
 """So far from the strip that it closes a barrier may stand: strips end where corners begin, and those are wide."""
@@ -59,7 +59,7 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
     spots = [Point(event.x_m, event.y_m) for scenario in scenarios for event in scenario.events]
     near = shapely.union_all([*(LineString(scenario.route) for scenario in scenarios), *spots])
     try:
-        area = WalkableArea(street_map.walkable_near(shapely.buffer(near, AROUND_M)))
+        area = WalkableArea(street_map.walkable_near(shapely.buffer(near, _AROUND_M)))
     except MapError:
         yield from (
             f"scenario '{one.id}': start {one.start[:2]} is not on map '{street_map.name}'" for one in scenarios
@@ -77,14 +77,14 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
 
 def _off(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
     """Where the route first leaves the walkable area, and which events are off it."""
-    line = scenario.route_line.resampled(SAMPLE_M)
-    off = np.flatnonzero(area.signed_distance(line.points) < -EDGE_M)
+    line = scenario.route_line.resampled(_SAMPLE_M)
+    off = np.flatnonzero(area.signed_distance(line.points) < -_EDGE_M)
     if len(off):
         (x_m, y_m), s_m = line.points[off[0]], line.s_m[off[0]]
         what = "start" if off[0] == 0 else "route"
         yield f"{what} is off the walkable area at ({x_m:.2f}, {y_m:.2f}), {s_m:.1f} m along the route"
     for event in scenario.events:
-        if area.signed_distance([event.x_m, event.y_m])[0] < -EDGE_M:
+        if area.signed_distance([event.x_m, event.y_m])[0] < -_EDGE_M:
             yield f"event '{event.id}' is off the walkable area at ({event.x_m:.2f}, {event.y_m:.2f})"
 
 

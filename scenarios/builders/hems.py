@@ -19,13 +19,13 @@ from cosim.place.street_map import SEAM_M, Port, StreetMap, Strip, union_closed
 from cosim.spec.scenario import Barrier
 from scenarios.builders.barriers import OVERHANG_M, THICKNESS_M, branches, corner_of
 
-NEAR_M = 3.0
+_NEAR_M = 3.0
 """Ground farther from the way does not border on it."""
 SMOOTH_M = 0.15
-SHORTEST_M = 0.02
-BESIDE_M, STRIP_M = 0.5, 5.0
+_SHORTEST_M = 0.02
+_BESIDE_M, STRIP_M = 0.5, 5.0
 """A fence stands so far from the strip that it names as the second, and as the first, at most."""
-FAR_M = 10_000.0
+_FAR_M = 10_000.0
 MOST = 150
 """A way that needs more fences is no way."""
 
@@ -40,7 +40,7 @@ def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
     corners = sorted({corner_of(street_map, port) for port in way} - {""})
     pieces = [street_map.strips[name].polygon for name in sorted(strips)]
     ground = union_closed([*pieces, *(street_map.corners[name].polygon for name in corners)])
-    walkable = street_map.walkable_near(shapely.buffer(ground, NEAR_M))
+    walkable = street_map.walkable_near(shapely.buffer(ground, _NEAR_M))
     # What is within SEAM_M of the edge of all that is walkable borders on nothing.
     border = overlay.intersection(shapely.boundary(ground), shapely.buffer(walkable, -1.2 * SEAM_M))
     sides = np.array([side for line in shapely.get_parts(border) for side in _sides(line)]).reshape(-1, 2, 2)
@@ -64,13 +64,13 @@ def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[
     ends = np.array([street_map.strips[port.strip].line[0 if port.end == 0 else -1, :2] for port in ports])
     apart = np.hypot(*(sides.mean(axis=1)[:, None] - ends[None]).transpose(2, 0, 1))
     # Of strips that are equally near the one whose end is nearer.
-    best = (np.round(beside, 1) * FAR_M + apart).argmin(axis=1)
+    best = (np.round(beside, 1) * _FAR_M + apart).argmin(axis=1)
     if beside[np.arange(len(sides)), best].max() > STRIP_M:
         raise SpecError("the way borders on ground that belongs to no strip")
     named = [(i, int(k)) for i, k in enumerate(best)]
     for k in sorted(set(range(len(ports))) - set(best.tolist())):
         i = int(beside[:, k].argmin())
-        if beside[i, k] <= BESIDE_M:
+        if beside[i, k] <= _BESIDE_M:
             named.append((i, k))
     return named
 
@@ -81,7 +81,7 @@ def _sides(line: shapely.Geometry) -> Floats:
         return np.empty((0, 2, 2))
     points = shapely.get_coordinates(shapely.simplify(line, SMOOTH_M))
     pairs = np.stack([points[:-1], points[1:]], axis=1)
-    straight: Floats = pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= SHORTEST_M]
+    straight: Floats = pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= _SHORTEST_M]
     return straight
 
 

@@ -15,14 +15,14 @@ from cosim.place.map_check import on_road_shares
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import Event, Kind
+from cosim.spec.events import Event, EventName
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
-from scenarios.builders.drawing import TRIES, Refusals, along, first_of
+from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of
 from scenarios.builders.hems import hem
 
-SHORTEST_M = 120.0
-LONGEST_M = 560.0
+_SHORTEST_M = 120.0
+_LONGEST_M = 560.0
 STRIP_MIN_M = 30.0
 """Start and goal lie on sidewalks at least this long."""
 
@@ -35,7 +35,7 @@ ON_ROAD_M = 2.0
 
 CROSSING_EVERY_M = 160.0
 EVENT_EVERY_M = 90.0
-EVENT_KINDS: tuple[Kind, ...] = ("obstructing", "frontal")
+EVENT_KINDS: tuple[EventName, ...] = ("obstructing", "frontal")
 EVENT_WALKWAY_M = 3.0
 """Events take place on sidewalks at least this wide: there is room to pass."""
 
@@ -56,7 +56,7 @@ EVENT_STRAIGHT_M = 24.0
 EVENT_BEND_M = 0.4
 
 
-def build(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
+def build_long_horizon(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
     """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are searched for that can be
     fenced in all along. Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
@@ -105,13 +105,13 @@ def _along(
 ) -> Scenario:
     """The scenario along a way. Raises SpecError when the way does not do."""
     route = Polyline(np.round(way_line(street_map, way, *ends_m).points, 3))
-    if not SHORTEST_M <= route.length_m <= 1.2 * LONGEST_M:
+    if not _SHORTEST_M <= route.length_m <= 1.2 * _LONGEST_M:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
     barriers = fences(street_map, route, way)
-    bare = along(
+    bare = events_along(
         route,
         crossings,
         place,
@@ -170,7 +170,7 @@ def draw_way(
     street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str]
 ) -> tuple[list[Port], float, float]:
     """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line` takes it."""
-    target_m = rng.uniform(SHORTEST_M, LONGEST_M)
+    target_m = rng.uniform(_SHORTEST_M, _LONGEST_M)
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
@@ -196,7 +196,7 @@ def search_way(
     street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str], avoided: Set[str]
 ) -> tuple[list[Port], float, float]:
     """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that does."""
-    target_m = rng.uniform(SHORTEST_M, LONGEST_M)
+    target_m = rng.uniform(_SHORTEST_M, _LONGEST_M)
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m

@@ -16,22 +16,22 @@ from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import GROUPS, Event, Kind
+from cosim.spec.events import GROUPS, Event, EventName
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
-from scenarios.builders.drawing import along, first_that_fits
+from scenarios.builders.drawing import events_along, first_that_fits
 from scenarios.builders.long_horizon import route_crossings
 
-LIMIT_S = 60.0
+_LIMIT_S = 60.0
 CROWD = CrowdSpec(persons=12, radius_m=80.0, vehicles=8)
 BESIDE_CROSSING_M = (2.0, 5.0)
 """Way driven before a crosswalk and after it, least and most."""
-ROOM_M = 0.35
+_ROOM_M = 0.35
 """Half the width of what is walkable there."""
-SHORTEST_M = 10.0
+_SHORTEST_M = 10.0
 ENDS_CLEAR_M = 6.0
 """Way and event keep this far from the ends of their sidewalk."""
 BEND_M = 0.15
-SPEEDS_MPS = (1.1, 1.65)
+_SPEEDS_MPS = (1.1, 1.65)
 """Walking speeds of the paper."""
 OPEN_M = 1.25
 """Width that a queue leaves beside it."""
@@ -39,7 +39,7 @@ GROUP_M = 1.95
 """Half the width of a sidewalk on which one can pass round a group of talkers in its middle."""
 
 
-class Layout(NamedTuple):
+class _Layout(NamedTuple):
     """Where things are along a way. way_m: its length, shortest and longest; event_m: from the start to the event's
     place, nearest and farthest; half_width_m: least half of the sidewalk's width."""
 
@@ -48,22 +48,24 @@ class Layout(NamedTuple):
     half_width_m: float = 1.3
 
 
-LAYOUTS: Mapping[Kind, Layout] = MappingProxyType(
+LAYOUTS: Mapping[EventName, _Layout] = MappingProxyType(
     {
-        "obstructing": Layout((18.0, 20.0), (11.0, 13.0)),
-        "conversing": Layout((18.0, 20.0), (11.5, 13.0), GROUP_M),
-        "queueing": Layout((18.0, 20.0), (11.0, 13.0), 1.4),
-        "gesturing": Layout((18.0, 20.0), (11.0, 13.0)),
-        "frontal": Layout((18.0, 20.0), (21.0, 22.0)),
-        "lateral": Layout((15.0, 20.0), (8.0, 11.0)),
-        "overtaking": Layout((18.0, 20.0), (1.5, 3.0), 1.4),
-        "ped_crossing": Layout((10.0, 20.0), (0.0, 0.0)),
+        "obstructing": _Layout((18.0, 20.0), (11.0, 13.0)),
+        "conversing": _Layout((18.0, 20.0), (11.5, 13.0), GROUP_M),
+        "queueing": _Layout((18.0, 20.0), (11.0, 13.0), 1.4),
+        "gesturing": _Layout((18.0, 20.0), (11.0, 13.0)),
+        "frontal": _Layout((18.0, 20.0), (21.0, 22.0)),
+        "lateral": _Layout((15.0, 20.0), (8.0, 11.0)),
+        "overtaking": _Layout((18.0, 20.0), (1.5, 3.0), 1.4),
+        "ped_crossing": _Layout((10.0, 20.0), (0.0, 0.0)),
     }
 )
 """An event lies farther from the start than its trigger reaches, so that it triggers on the way."""
 
 
-def build(kind: Kind, place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
+def build_reactive(
+    kind: EventName, place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str
+) -> Scenario:
     """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is found."""
     rng = np.random.default_rng([seed, place.seed, 0x4EAC7, sorted(GROUPS).index(kind)])
     wanted = "crossing" if kind == "ped_crossing" else "sidewalk"
@@ -82,7 +84,7 @@ def build(kind: Kind, place: Place, street_map: StreetMap, graph: WalkGraph, see
 
 
 def _along_sidewalk(
-    kind: Kind,
+    kind: EventName,
     place: Place,
     street_map: StreetMap,
     strip: Strip,
@@ -120,13 +122,13 @@ def _along_sidewalk(
         route_s_m=event_m,
         half_width_m=half_m,
         people=_group(kind, half_m, rng),
-        speed_mps=float(rng.uniform(*SPEEDS_MPS)),
+        speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
         side=side,
     )
     return _scenario(place, street_map, route, event, (), seed, scenario_id)
 
 
-def _group(kind: Kind, half_m: float, rng: np.random.Generator) -> int:
+def _group(kind: EventName, half_m: float, rng: np.random.Generator) -> int:
     """How many people: talkers as drawn; a queue as long as leaves OPEN_M beside it, past the middle."""
     fewest, most = GROUPS[kind]
     if kind == "queueing":
@@ -148,18 +150,18 @@ def _over_crossing(
     crossings = route_crossings(street_map, route, [Port(strip.id, 0 if leave else 1), Port(strip.id, leave)])
     middle_m = 0.5 * (crossings[0].enter_s_m + crossings[0].leave_s_m)
     pose = route.at(middle_m)
-    along = ends[1] - ends[0]
+    events_along = ends[1] - ends[0]
     event = Event(
         id="e0",
         kind="ped_crossing",
         x_m=pose.x_m,
         y_m=pose.y_m,
-        heading_rad=math.atan2(along[1], along[0]),
+        heading_rad=math.atan2(events_along[1], events_along[0]),
         route_s_m=middle_m,
         half_width_m=strip.width_m / 2,
         half_length_m=0.5 * (crossings[0].leave_s_m - crossings[0].enter_s_m),
         people=int(rng.integers(2, GROUPS["ped_crossing"][1] + 1)),
-        speed_mps=float(rng.uniform(*SPEEDS_MPS)),
+        speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
         side=1 if rng.random() < 0.5 else -1,
     )
     return _scenario(place, street_map, route.points, event, crossings, seed, scenario_id)
@@ -168,18 +170,18 @@ def _over_crossing(
 def _straight_over(street_map: StreetMap, ends: Floats) -> Floats:
     """(2, 2) m: a way straight over a crosswalk, from before its first end to beyond its second, as far as one can walk
     straight on there: who only drives straight ahead stays on it. Raises SpecError when that is too short."""
-    along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+    events_along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     walkable = street_map.walkable_near(shapely.buffer(LineString(ends), BESIDE_CROSSING_M[1] + 1.0))
     reached = []
-    for end, outward in ((ends[0], -along), (ends[1], along)):
+    for end, outward in ((ends[0], -events_along), (ends[1], events_along)):
         for far_m in np.arange(BESIDE_CROSSING_M[1], BESIDE_CROSSING_M[0] - 1e-9, -0.25):
-            beyond = shapely.buffer(LineString([end, end + far_m * outward]), ROOM_M)
+            beyond = shapely.buffer(LineString([end, end + far_m * outward]), _ROOM_M)
             if shapely.covers(walkable, beyond):
                 reached.append(end + far_m * outward)
                 break
         else:
             raise SpecError("no room straight on beside the crossing")
-    if np.hypot(*(reached[1] - reached[0])) < SHORTEST_M:
+    if np.hypot(*(reached[1] - reached[0])) < _SHORTEST_M:
         raise SpecError("way over the crossing too short")
     return np.array(reached)
 
@@ -193,7 +195,7 @@ def _scenario(
     seed: int,
     scenario_id: str,
 ) -> Scenario:
-    bare = along(
+    bare = events_along(
         Polyline(route),
         crossings,
         place,
@@ -201,7 +203,7 @@ def _scenario(
         suite="reactive",
         seed=seed,
         scenario_id=scenario_id,
-        time_limit_s=LIMIT_S,
+        time_limit_s=_LIMIT_S,
     )
     return msgspec.structs.replace(
         bare,

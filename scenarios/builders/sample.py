@@ -14,17 +14,17 @@ from cosim.core.errors import MapError, SpecError, unknown
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import GROUPS, Kind
+from cosim.spec.events import GROUPS, EventName
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.builders import long_horizon, reactive
 from scenarios.execution.places import place
 from sumo_nets.maps.place_names import place_called
 
-KINDS = ("long-horizon", "reactive")
+_KINDS = ("long-horizon", "reactive")
 PERSON_M2 = 25.0
 """Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
 
-SAMPLE_M = 20.0
+_SAMPLE_M = 20.0
 
 
 def suite_on_map(
@@ -39,8 +39,8 @@ def suite_on_map(
 
     Raises UsageError for another kind of suite, and whatever the place or the builder has to refuse.
     """
-    if kind not in KINDS:
-        raise unknown("suite for --map", kind, KINDS)
+    if kind not in _KINDS:
+        raise unknown("suite for --map", kind, _KINDS)
     for event in events:
         if event not in GROUPS:
             raise unknown("event", event, GROUPS)
@@ -70,7 +70,7 @@ class _Drawn(NamedTuple):
         """So many long-horizon scenarios; nothing is left out."""
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
-        build = long_horizon.build
+        build = long_horizon.build_long_horizon
         return [build(self.where, self.street_map, self.graph, n, i) for n, i in zip(seeds, ids, strict=True)], []
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
@@ -95,9 +95,9 @@ class _Drawn(NamedTuple):
             raise SpecError(f"no reactive scenario fits on '{self.name}': {' '.join(left_out)}")
         return found, left_out
 
-    def _one(self, kind: Kind, seed: int) -> Scenario:
+    def _one(self, kind: EventName, seed: int) -> Scenario:
         scenario_id = f"{kind}-{self.name}-{seed:03d}"
-        return reactive.build(kind, self.where, self.street_map, self.graph, seed, scenario_id)
+        return reactive.build_reactive(kind, self.where, self.street_map, self.graph, seed, scenario_id)
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
@@ -105,7 +105,7 @@ def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
     route = Polyline(np.array(scenario.route))
     around = [
         shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
-        for s_m in np.arange(0.0, route.length_m, SAMPLE_M)
+        for s_m in np.arange(0.0, route.length_m, _SAMPLE_M)
     ]
     area_m2 = [
         sum(

@@ -33,7 +33,7 @@ def ahead(within_m: float) -> Callable[[Event, EventQuery], float | None]:
     return trigger
 
 
-def behind(by_m: float) -> Callable[[Event, EventQuery], float | None]:
+def once_behind(by_m: float) -> Callable[[Event, EventQuery], float | None]:
     """Begins at the last tick at which the event's place is no farther behind the robot than this."""
 
     def trigger(event: Event, query: EventQuery) -> float | None:

@@ -14,13 +14,13 @@ from cosim.core.state import Doing
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.behavior import Behavior, entered
 from scenarios.events.sight import Sight, sight_of
-from scenarios.events.walking import edge_m, gave_up, placed, pressed_on, walked_on
+from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 
-BEFORE_M: Final = 0.8
+_BEFORE_M: Final = 0.8
 """How far before its end of the crosswalk each one waits, and behind its other end it is done."""
 BEHIND_ROBOT_M: Final = 1.6
 """Those from behind wait this much farther back: the robot has just passed them."""
-ABREAST_M: Final = 0.75
+_ABREAST_M: Final = 0.75
 """Between the lines of two who walk the same way."""
 
 
@@ -29,11 +29,11 @@ def _begin(event: Event) -> tuple[Walker, ...]:
 
 
 def _waiting(event: Event, number: int) -> Walker:
-    reach_m = event.half_length_m + BEFORE_M
+    reach_m = event.half_length_m + _BEFORE_M
     left_m = max(-edge_m(event), min(edge_m(event), line_m(event, number)))
     if from_front(number):
-        return placed(event, reach_m, left_m, math.pi)
-    return placed(event, -reach_m - BEHIND_ROBOT_M, left_m, 0.0)
+        return walker_at(event, reach_m, left_m, math.pi)
+    return walker_at(event, -reach_m - BEHIND_ROBOT_M, left_m, 0.0)
 
 
 def from_front(number: int) -> bool:
@@ -45,8 +45,8 @@ def line_m(event: Event, number: int) -> float:
     """How far left of the middle of the crosswalk a person walks; the first one on the middle."""
     rank = number // 2
     if from_front(number):
-        return -event.side * rank * ABREAST_M
-    return event.side * (rank + 1) * ABREAST_M
+        return -event.side * rank * _ABREAST_M
+    return event.side * (rank + 1) * _ABREAST_M
 
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
@@ -79,7 +79,7 @@ def _passed(event: Event, walker: Walker, query: EventQuery) -> bool:
 
 def _across(event: Event, walker: Walker, number: int) -> bool:
     done_m = _along_m(event, walker.x_m, walker.y_m) * (-1.0 if from_front(number) else 1.0)
-    return done_m >= event.half_length_m + BEFORE_M
+    return done_m >= event.half_length_m + _BEFORE_M
 
 
 def _doing(event: Event, state: EventState, number: int) -> Doing:

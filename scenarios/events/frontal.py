@@ -16,15 +16,15 @@ from cosim.core.state import Doing
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.behavior import Behavior, ahead
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import gave_up, placed, pressed_on, walked_on
+from scenarios.events.walking import gave_up, pressed_on, walked_on, walker_at
 
-TRIGGER_M: Final = 20.0
+FRONTAL_TRIGGER_M: Final = 20.0
 COMMIT_M: Final = 5.0
 """It aims at the robot's current position until this close, then keeps its line as people do."""
 
 
 def _begin(event: Event) -> tuple[Walker, ...]:
-    return (placed(event, 0.0, 0.0, math.pi),)
+    return (walker_at(event, 0.0, 0.0, math.pi),)
 
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
@@ -47,4 +47,4 @@ def _doing(event: Event, state: EventState, number: int) -> Doing:
     return "stand"
 
 
-FRONTAL: Final = Behavior(ahead(TRIGGER_M), _begin, _act, _doing)
+FRONTAL: Final = Behavior(ahead(FRONTAL_TRIGGER_M), _begin, _act, _doing)

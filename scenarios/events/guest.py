@@ -12,10 +12,10 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from cosim.people.yielding import KEEP_M, touches
+from cosim.people.yielding import STEP_ROUND_GAP_M, touches
 from cosim.spec.events import GUEST, Actor, EventQuery, Walker
 from cosim.spec.injection import Injected, Injection
-from scenarios.events.sight import BESIDE_M, STILL_MPS, sight_of_guest, taken
+from scenarios.events.sight import BESIDE_M, STILL_MPS, place_taken, sight_of_guest
 from scenarios.events.walking import robot_of, turned, walked_to
 
 
@@ -39,7 +39,7 @@ def arriving(injected: Injected) -> Guest:
     return Guest(injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick)
 
 
-def advanced(guest: Guest, query: EventQuery) -> Guest | None:
+def guest_moved_on(guest: Guest, query: EventQuery) -> Guest | None:
     """One tick on; None once it is gone."""
     injection, walker = guest.injection, guest.walker
     if guest.arrived_tick is not None:
@@ -52,7 +52,9 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
     goal = injection.path[guest.leg]
     sight = sight_of_guest(shown_id(injection), walker, query)
     after = walked_to(walker, *goal, injection.speed_mps, sight)
-    reached = (after.x_m, after.y_m) == goal or taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
+    reached = (
+        (after.x_m, after.y_m) == goal or place_taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
+    )
     vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))
     after = msgspec.structs.replace(after, vx_mps=vx_mps, vy_mps=vy_mps)
     moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
@@ -64,7 +66,7 @@ def advanced(guest: Guest, query: EventQuery) -> Guest | None:
 def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
     """Whether the robot stands where nobody can reach a point then, and the walker has come up to it."""
     near = math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M
-    return near and abs(query.robot_v_mps) < STILL_MPS and touches(np.array(goal), robot_of(query), KEEP_M)
+    return near and abs(query.robot_v_mps) < STILL_MPS and touches(np.array(goal), robot_of(query), STEP_ROUND_GAP_M)
 
 
 def shown_id(injection: Injection) -> str:
@@ -72,7 +74,7 @@ def shown_id(injection: Injection) -> str:
     return f"{GUEST}{injection.id}"
 
 
-def actor_of(guest: Guest, tick_ms: int) -> Actor:
+def guest_actor(guest: Guest, tick_ms: int) -> Actor:
     """The guest as the world shows it; who is held up on the way stands."""
     walker = guest.walker
     still = "stand" if guest.arrived_tick is None else guest.injection.doing

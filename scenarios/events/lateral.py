@@ -15,16 +15,16 @@ from cosim.core.state import Doing
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.behavior import Behavior, ahead
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import edge_m, gave_up, placed, pressed_on, walked_on
+from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 
-TRIGGER_M: Final = 4.0
+LATERAL_TRIGGER_M: Final = 4.0
 SLOWEST_MPS: Final = 0.2
-FASTEST_MPS: Final = 2.0
+_FASTEST_MPS: Final = 2.0
 """A robot that stands is crossed before at the slowest pace; nobody runs faster than this."""
 
 
 def _begin(event: Event) -> tuple[Walker, ...]:
-    return (placed(event, 0.0, event.side * edge_m(event), -event.side * math.pi / 2),)
+    return (walker_at(event, 0.0, event.side * edge_m(event), -event.side * math.pi / 2),)
 
 
 def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
@@ -69,11 +69,11 @@ def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[floa
     towards = -math.copysign(1.0, left_m if abs(left_m) > 1e-6 else side)
     in_s = max(ahead_m, 0.0) / max(query.robot_v_mps, 1e-6)
     pace_mps = abs(left_m) / max(in_s, 1e-6)
-    return query.robot_heading_rad + towards * math.pi / 2, min(max(pace_mps, SLOWEST_MPS), FASTEST_MPS)
+    return query.robot_heading_rad + towards * math.pi / 2, min(max(pace_mps, SLOWEST_MPS), _FASTEST_MPS)
 
 
 def _doing(event: Event, state: EventState, number: int) -> Doing:
     return "stand"
 
 
-LATERAL: Final = Behavior(ahead(TRIGGER_M), _begin, _act, _doing)
+LATERAL: Final = Behavior(ahead(LATERAL_TRIGGER_M), _begin, _act, _doing)

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Kind
+from cosim.spec.events import Actor, Event, EventName, EventQuery, EventReply, EventState
 from scenarios.events.behavior import Behavior
 from scenarios.events.crossing import PED_CROSSING
 from scenarios.events.frontal import FRONTAL
@@ -24,7 +24,7 @@ SHOWN_BEHIND_M = 30.0
 LEAVES_M = 15.0
 """Those whose event is over are gone for good when the robot is this far from all of them: out of its sight."""
 
-BEHAVIORS: Mapping[Kind, Behavior] = MappingProxyType(
+BEHAVIORS: Mapping[EventName, Behavior] = MappingProxyType(
     {
         "obstructing": OBSTRUCTING,
         "conversing": CONVERSING,

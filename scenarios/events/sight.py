@@ -10,7 +10,7 @@ import msgspec
 
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.orca import HalfPlane
-from cosim.people.steering import HORIZON_S, LEAST_M, ROOM_M, Neighbour, Vector, steered
+from cosim.people.steering import HORIZON_S, ROOM_M, SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
 from cosim.spec.events import Bystander, Event, EventQuery, Walker
 
 COMES_UP_M = 1.5
@@ -60,7 +60,7 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
     ]
     if waited_s < PRESSES_S:
         others += met(query.bystanders)
-    return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else LEAST_M)
+    return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else SHOULDER_TO_SHOULDER_M)
 
 
 def sight_of_guest(name: str, guest: Walker, query: EventQuery) -> Sight:
@@ -94,10 +94,10 @@ def met(bystanders: Iterable[Bystander]) -> list[Neighbour]:
     ]
 
 
-def taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
+def place_taken(walker: Walker, goal: Vector, sight: Sight) -> bool:
     """Whether somebody stands where the walker wants to stop, and the walker has come up to them."""
     return math.dist((walker.x_m, walker.y_m), goal) < BESIDE_M and any(
-        math.dist(other[:2], goal) < LEAST_M and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
+        math.dist(other[:2], goal) < SHOULDER_TO_SHOULDER_M and math.hypot(other.vx_mps, other.vy_mps) < STILL_MPS
         for other in sight.others
     )
 
@@ -117,7 +117,7 @@ def led_round(
         far_m = math.dist(at, goal)
         horizon_s = min(HORIZON_S, max(far_m / max(math.hypot(*velocity), 1e-9), tick_s))
         if insisting and far_m < COMES_UP_M:
-            others = [other for other in others if math.dist(other[:2], goal) > LEAST_M]
+            others = [other for other in others if math.dist(other[:2], goal) > SHOULDER_TO_SHOULDER_M]
     if not others:
         return wanted
     vx, vy = steered(

@@ -16,9 +16,9 @@ from cosim.core.state import PERSON_RADIUS_M, Doing
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.behavior import Behavior, ahead
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import edge_m, placed, spot, turned, walked_to
+from scenarios.events.walking import edge_m, spot, turned, walked_to, walker_at
 
-TRIGGER_M: Final = 10.0
+STANDING_TRIGGER_M: Final = 10.0
 LOOK_PERIOD_S: Final = 4.0
 LOOK_SWING_RAD: Final = 1.0
 TALK_M: Final = 0.62
@@ -28,39 +28,39 @@ QUEUE_M: Final = 0.65
 WAITING_M: Final = 0.8
 """From one to the next of those who wait at the edge."""
 
-Place = tuple[float, float]
+_Place = tuple[float, float]
 """Metres along the event's heading and to the left."""
 Facing = Callable[[Event, Walker, EventQuery, EventState], float]
 
 
-def talking_places(event: Event) -> tuple[Place, ...]:
+def talking_places(event: Event) -> tuple[_Place, ...]:
     """Evenly on a circle round the middle of the sidewalk, two of them abreast of the robot's way."""
     radius_m = TALK_M * (1.15 if event.people == 4 else 1.0)
     angles = [math.pi / 2 + 2.0 * math.pi * k / event.people for k in range(event.people)]
     return tuple((radius_m * math.cos(a), radius_m * math.sin(a)) for a in angles)
 
 
-def queue_places(event: Event) -> tuple[Place, ...]:
+def queue_places(event: Event) -> tuple[_Place, ...]:
     """A tight line across the sidewalk that begins at the edge of its side."""
     first_m = event.half_width_m - PERSON_RADIUS_M
     return tuple((0.0, event.side * (first_m - k * QUEUE_M)) for k in range(event.people))
 
 
-def middle(event: Event) -> tuple[Place, ...]:
+def middle(event: Event) -> tuple[_Place, ...]:
     """One person, in the middle."""
     return ((0.0, 0.0),)
 
 
-def _aside(event: Event, number: int) -> Place:
+def _aside(event: Event, number: int) -> _Place:
     """Where somebody waits for the trigger: along the edge."""
     return (WAITING_M * (number - (event.people - 1) / 2), event.side * edge_m(event))
 
 
 def _begin(event: Event) -> tuple[Walker, ...]:
-    return tuple(placed(event, *_aside(event, k), math.pi) for k in range(event.people))
+    return tuple(walker_at(event, *_aside(event, k), math.pi) for k in range(event.people))
 
 
-def _standing(places: Callable[[Event], tuple[Place, ...]], facing: Facing, doing: Doing) -> Behavior:
+def _standing(places: Callable[[Event], tuple[_Place, ...]], facing: Facing, doing: Doing) -> Behavior:
     """The behaviour of those who step to `places`, face somewhere there, and show what they do."""
 
     def act(event: Event, state: EventState, query: EventQuery) -> EventState:
@@ -86,7 +86,7 @@ def _standing(places: Callable[[Event], tuple[Place, ...]], facing: Facing, doin
     def shown(event: Event, state: EventState, number: int) -> Doing:
         return doing if state.phase == "acting" else "stand"
 
-    return Behavior(ahead(TRIGGER_M), _begin, act, shown)
+    return Behavior(ahead(STANDING_TRIGGER_M), _begin, act, shown)
 
 
 def _about(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:

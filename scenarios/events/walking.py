@@ -10,19 +10,19 @@ import numpy as np
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.people.steering import Vector
-from cosim.people.yielding import Body, stepped_round, touches, within_reach_m
+from cosim.people.yielding import RobotBody, stepped_round, touches, within_reach_m
 from cosim.spec.events import Event, EventQuery, Walker
-from scenarios.events.sight import Sight, led_round, taken
+from scenarios.events.sight import Sight, led_round, place_taken
 
 EDGE_GAP_M = 0.1
 TURN_RADPS = math.pi
 SLOW_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
-GIVES_UP_S = 2.0
+_GIVES_UP_S = 2.0
 """How long somebody stands against a robot that it has run into before it goes round."""
 
 
-def placed(event: Event, along_m: float, left_m: float, facing_rad: float) -> Walker:
+def walker_at(event: Event, along_m: float, left_m: float, facing_rad: float) -> Walker:
     """Somebody at a place of the event's frame: metres along its heading and to the left, facing in that frame."""
     x_m, y_m = spot(event, along_m, left_m)
     return Walker(x_m=x_m, y_m=y_m, heading_rad=wrap_angle(event.heading_rad + facing_rad))
@@ -39,10 +39,10 @@ def edge_m(event: Event) -> float:
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
 
 
-def robot_of(query: EventQuery) -> Body:
+def robot_of(query: EventQuery) -> RobotBody:
     """The robot as people see it."""
     pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
-    return Body(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
+    return RobotBody(pose, (query.robot_length_m / 2, query.robot_width_m / 2), query.robot_v_mps)
 
 
 def turned(heading_rad: float, wanted_rad: float, tick_s: float) -> float:
@@ -56,7 +56,7 @@ def walked_to(
 ) -> Walker:
     """One tick towards a point, facing it, round people and the robot where they are in the way; exactly there when in
     reach. Where somebody is there already one stands beside them, unless one insists: then they make room."""
-    if not insisting and taken(walker, (x_m, y_m), sight):
+    if not insisting and place_taken(walker, (x_m, y_m), sight):
         return walker
     tick_s = sight.query.tick_ms / 1000
     dx, dy = x_m - walker.x_m, y_m - walker.y_m
@@ -119,4 +119,4 @@ def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sigh
 
 def gave_up(walker: Walker, query: EventQuery) -> bool:
     """Whether somebody has stood against the robot long enough."""
-    return walker.blocked_ticks * query.tick_ms / 1000 >= GIVES_UP_S
+    return walker.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S

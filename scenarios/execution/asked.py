@@ -12,9 +12,9 @@ import struct
 import time
 from typing import Final, NamedTuple, get_args
 
-from cosim.episode.driver import Doing, when
+from cosim.episode.driver import PolicyCall, when
 
-_DOINGS: Final[tuple[Doing, ...]] = get_args(Doing)
+_DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
 _LAYOUT: Final = struct.Struct("dqq")  # since when, 0.0 while nothing is asked; what it is doing; at which tick
 
 
@@ -24,7 +24,7 @@ class Patience(NamedTuple):
     answer_s: float = 60.0
     start_s: float = 300.0
 
-    def of(self, doing: Doing) -> float:
+    def of(self, doing: PolicyCall) -> float:
         return self.answer_s if doing == "act" else self.start_s
 
 
@@ -32,7 +32,7 @@ class Question(NamedTuple):
     """What a policy is asked. since_s: on the monotonic clock, which all processes of a machine share."""
 
     since_s: float
-    doing: Doing
+    doing: PolicyCall
     tick: int
 
     def overdue(self, patience: Patience) -> bool:
@@ -59,7 +59,7 @@ class Asked:
         os.ftruncate(descriptor, _LAYOUT.size)
         return cls(descriptor)
 
-    def starts(self, doing: Doing, tick: int) -> None:
+    def starts(self, doing: PolicyCall, tick: int) -> None:
         _LAYOUT.pack_into(self._memory, 0, time.monotonic(), _DOINGS.index(doing), tick)
 
     def stops(self) -> None:

@@ -20,11 +20,11 @@ from scenarios.execution.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
 
 TELL_EVERY_TICKS: Final = 20
-Tell = Callable[[float], None]
+TellShare = Callable[[float], None]
 """Takes in which share of the street without the robot has been simulated."""
 
 
-def untold(share: float) -> None:
+def untold_share(share: float) -> None:
     """Nobody wants to know."""
 
 
@@ -57,7 +57,7 @@ class Beside:
         self._present[0].add(step.street_after.people)
         self._present[1].add(step.street_after.vehicles)
 
-    def compared(self, scenario: Scenario, entrances: Entrances, tell: Tell = untold) -> Compared:
+    def compared(self, scenario: Scenario, entrances: Entrances, tell: TellShare = untold_share) -> Compared:
         """entrances: of the episode. No SUMO may be running in this process."""
         absent = Tracks("c"), Tracks("v")
         with crowd_of(scenario, entrances) as crowd:

@@ -34,7 +34,7 @@ from cosim.records.record import Record, begun
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.execution.on_air import OnAir
-from scenarios.execution.wiring import Stage, staged
+from scenarios.execution.wiring import StagedScenario, staged
 from sumo_nets.crowd.demand_log import Entrances
 
 Watch = Callable[[Step, Verdict], None]
@@ -64,7 +64,7 @@ class Episode:
         *,
         watches: Sequence[Watch] = (),
         waiting: Callable[[str], None] = unheard,
-        through: Callable[[Stage], None] | None = None,
+        through: Callable[[StagedScenario], None] | None = None,
     ) -> None:
         self.scenario, self.manifest, self.options = scenario, manifest, options
         self.clock = Clock.for_rate(manifest.rate_hz)
@@ -73,7 +73,7 @@ class Episode:
         self._began_s = time.perf_counter()
         self._setup_s = 0.0
         self._stack = ExitStack()
-        self._stage: Stage | None = None
+        self._stage: StagedScenario | None = None
         self._now: Moment | None = None
         self._frame: Frame | None = None
         self._verdict = Verdict()
@@ -178,7 +178,7 @@ class Episode:
             self._result = msgspec.structs.replace(record, injections=self._injected.log, clock=clock), log
         return self._result
 
-    def _observe(self, stage: Stage, now: Moment) -> Observation:
+    def _observe(self, stage: StagedScenario, now: Moment) -> Observation:
         """What the policy is given now; what the simulator knows only to a policy whose manifest asks for it."""
         parts = stage.parts
         self._frame = parts.camera.render(now.robot, now.street) if parts.camera is not None else None
@@ -187,7 +187,7 @@ class Episode:
         return Observation(now.tick, self.clock.time_s(now.tick), rgb, now.robot.v_mps, now.robot.w_radps, known)
 
     @property
-    def _open(self) -> Stage:
+    def _open(self) -> StagedScenario:
         if self._stage is None:
             what = (
                 "is closed: make another Episode" if self._setup_s else "has not been entered: use it in a `with` block"
@@ -196,7 +196,7 @@ class Episode:
         return self._stage
 
     @property
-    def _begun(self) -> tuple[Stage, Moment]:
+    def _begun(self) -> tuple[StagedScenario, Moment]:
         stage = self._open
         if self._now is None:
             raise UsageError("this Episode has not begun: call reset() first, it gives the first observation")

@@ -15,7 +15,7 @@ import msgspec
 from cosim.episode.ports import Director
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection
-from scenarios.events.guest import Guest, actor_of, advanced, arriving
+from scenarios.events.guest import Guest, arriving, guest_actor, guest_moved_on
 
 MOST_GUESTS: Final = 100
 """At once, those under way to their first step included."""
@@ -75,7 +75,7 @@ class Guests:
         reply = self._director.react(query)
         here = {}
         for name, guest in before.items():
-            after = advanced(guest, query)
+            after = guest_moved_on(guest, query)
             if after is not None:
                 here[name] = after
         here |= new
@@ -83,5 +83,5 @@ class Guests:
             self._here = here
         if not here:
             return reply
-        actors = (*reply.actors, *(actor_of(guest, self._tick_ms) for guest in here.values()))
+        actors = (*reply.actors, *(guest_actor(guest, self._tick_ms) for guest in here.values()))
         return msgspec.structs.replace(reply, actors=actors)

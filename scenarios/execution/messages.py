@@ -76,7 +76,7 @@ class Unsaved(msgspec.Struct, frozen=True, tag=True):
 
 Message = Ready | Unable | Progress | Waits | Compares | Done | Unsaved
 
-encode = msgspec.msgpack.Encoder().encode
+encode_message = msgspec.msgpack.Encoder().encode
 decode_hello = msgspec.msgpack.Decoder(Hello).decode
 decode_job = msgspec.msgpack.Decoder(Job).decode
 decode_message = msgspec.msgpack.Decoder(Message).decode

@@ -28,7 +28,7 @@ from cosim.spec.scenario import Scenario
 from sumo_nets.city.store import cache_folder
 
 FILE: Final = "pace.jsonl"
-KEPT: Final = 500
+EPISODES_KEPT: Final = 500
 """So many lines stay when there are twice as many."""
 RECENT: Final = 40
 """The newest episodes that are looked at: the code and the machine change."""
@@ -44,7 +44,7 @@ COMPARES: Final = 1.4
 """The time of an episode that is compared with its street without the robot, in episodes that are not."""
 AT_LEAST: Final = (0.6, 1.5)
 """No estimate is narrower than this around its middle: a machine has other work, too, at times."""
-SHARED: Final = 1.4
+_SHARED: Final = 1.4
 """More processes than were measured share caches and memory: one of them may take so much longer."""
 
 
@@ -102,7 +102,7 @@ def estimate(
     others = alike[-RECENT:] if len(alike) >= ENOUGH else []
     found = same if len(same) >= ENOUGH else others
     slots = min(jobs, cores)
-    slower = SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
+    slower = _SHARED if slots > max((m.jobs for m in found), default=1) else 1.0
     setup_s = _around([m.setup_s for m in found]) if found else SETS_UP_S
 
     def taken_s(low_s: Iterable[float], high_s: Iterable[float]) -> tuple[float, float]:
@@ -169,9 +169,9 @@ def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("ab") as file:
         file.write(b"".join(line + b"\n" for line in lines))
-    if len(every := path.read_bytes().splitlines(keepends=True)) > 2 * KEPT:
+    if len(every := path.read_bytes().splitlines(keepends=True)) > 2 * EPISODES_KEPT:
         short = path.with_name(f"{FILE}.{os.getpid()}.part")
-        short.write_bytes(b"".join(every[-KEPT:]))
+        short.write_bytes(b"".join(every[-EPISODES_KEPT:]))
         short.replace(path)
 
 

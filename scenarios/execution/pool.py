@@ -29,9 +29,9 @@ SILENCE_S = 300.0
 """A worker that says nothing for so long, while its policy has nothing to answer, hangs in an engine."""
 
 POLL_S = 1.0
-KEPT = "finished episodes are kept; make room and go on with --resume"
+_KEPT = "finished episodes are kept; make room and go on with --resume"
 
-Tell = Callable[[Message], None]
+_Tell = Callable[[Message], None]
 
 
 def run_all(
@@ -41,7 +41,7 @@ def run_all(
     driver: Driver,
     *,
     jobs: int,
-    tell: Tell,
+    tell: _Tell,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     patience: Patience = Patience(),  # noqa: B008  a frozen value
 ) -> None:
@@ -84,7 +84,7 @@ class _Pool:
     """The workers of one run."""
 
     def __init__(
-        self, folder: RunFolder, hello: Hello, job_of: Callable[[Scenario], Job], tell: Tell, patience: Patience
+        self, folder: RunFolder, hello: Hello, job_of: Callable[[Scenario], Job], tell: _Tell, patience: Patience
     ) -> None:
         self._folder, self._hello, self._job_of = folder, hello, job_of
         self._tell, self._patience = tell, patience
@@ -129,7 +129,7 @@ class _Pool:
             if isinstance(message, Unable):
                 raise UsageError(message.reason) if message.blames_policy else MachineError(message.reason)
             if isinstance(message, Unsaved):
-                raise MachineError(f"{message.reason}: {KEPT}")
+                raise MachineError(f"{message.reason}: {_KEPT}")
             if isinstance(message, Ready):
                 one.ready, self._failed_starts = True, 0
                 continue
@@ -182,7 +182,7 @@ class _Pool:
             target.mkdir(parents=True, exist_ok=True)
             record.save(target / "record.json")
         except OSError as error:
-            raise unwritable(target, error, KEPT) from error
+            raise unwritable(target, error, _KEPT) from error
         self._folder.add(record)
         self._tell(Done(scenario.id, "crashed"))
 

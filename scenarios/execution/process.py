@@ -13,12 +13,13 @@ from typing import Final
 
 from cosim.core.errors import unwritable
 from scenarios.execution.asked import Asked, Question
-from scenarios.execution.messages import Hello, Job, Message, decode_message, encode
+from scenarios.execution.messages import Hello, Job, Message, decode_message, encode_message
 
 ENDING_S: Final = 10.0
 """What a process is left to end by itself, and then its shepherd to clear up."""
 _CODE: Final = (
-    "import sys; sys.path[:] = {path!r}; from scenarios.execution.shepherd import main; main({pipe}, {asked}, {run})"
+    "import sys; sys.path[:] = {path!r}; from scenarios.execution.shepherd import keep_worker; "
+    "keep_worker({pipe}, {asked}, {run})"
 )
 
 
@@ -51,7 +52,7 @@ class Process:
     def send(self, message: Hello | Job) -> None:
         """Say something. A process that died while it was idle does not hear it: its `messages` tell."""
         try:
-            self.pipe.send_bytes(encode(message))
+            self.pipe.send_bytes(encode_message(message))
         except (BrokenPipeError, ConnectionResetError):
             return
 

@@ -16,7 +16,7 @@ from cosim.episode.log import Log
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.policies.replay import Replay
-from cosim.records.record import Record, row_of
+from cosim.records.record import Record, log_row
 from cosim.records.run_folder import read_records
 from cosim.spec.options import CameraChoice, EpisodeOptions
 from cosim.spec.scenario import Scenario, read_suite
@@ -89,7 +89,7 @@ class Alike:
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """The next tick. Raises RunError when it is not the recorded one."""
-        now, then = np.array(row_of(step, verdict)), self._told.log.row(step.tick)
+        now, then = np.array(log_row(step, verdict)), self._told.log.row(step.tick)
         if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
             raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
 

@@ -16,7 +16,7 @@ from cosim.episode.ports import Policy
 from cosim.records.record import Record
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
-from scenarios.execution.counterfactual import Beside, Tell, untold
+from scenarios.execution.counterfactual import Beside, TellShare, untold_share
 from scenarios.execution.episode import Episode, Watch, unheard
 
 
@@ -36,7 +36,7 @@ def run_episode(
     *,
     watches: Sequence[Watch] = (),
     waiting: Callable[[str], None] = unheard,
-    comparing: Tell = untold,
+    comparing: TellShare = untold_share,
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
 

@@ -8,7 +8,7 @@ from cosim.core.clock import Clock
 from cosim.episode.log import Log
 from cosim.episode.step import Step
 from cosim.judge.event_monitor import Witness, unwitnessed
-from cosim.judge.metrics import Episode, measure
+from cosim.judge.metrics import EpisodeFacts, every_metric
 from cosim.judge.referee import Failure, Referee, Verdict
 from cosim.judge.traffic import Roadway
 from cosim.place.street_map import StreetMap, WalkableArea
@@ -51,7 +51,7 @@ class Scorer:
         scenario, log, events = self._scenario, self._recorder.log(self._monitor.tracks), self._monitor.outcomes()
         broken = sum(event.rule_met is False for event in events)
         ended, failures = self._verdict.ended, tuple(self._failures)
-        seen = Episode(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken)
+        seen = EpisodeFacts(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken)
         reason = unseen(scenario, events)
         record = msgspec.structs.replace(
             begun,
@@ -60,7 +60,7 @@ class Scorer:
             ended=ended,
             ticks=len(log),
             state_hash=self._recorder.hash.hexdigest(),
-            measures=measure(seen),
+            measures=every_metric(seen),
             failures=failures,
             events=events,
         )

@@ -32,7 +32,7 @@ KILLING_S = 10.0
 """A killed process is gone at once, unless the kernel holds it."""
 
 
-def main(pipe: int, asked: int, parent: int) -> None:
+def keep_worker(pipe: int, asked: int, parent: int) -> None:
     """Run one worker and end as it ended.
 
     pipe, asked: descriptors of its connection to the run and of `scenarios.execution.asked`. parent: process id of the
@@ -141,7 +141,7 @@ def _be_worker(pipe: int, asked: int, prints: int, shepherd: int) -> None:
     os.dup2(prints, 2)
     os.close(prints)
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    from scenarios.execution.worker import main as work
+    from scenarios.execution.worker import serve_jobs as work
 
     work(pipe, asked)
 

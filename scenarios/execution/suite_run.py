@@ -19,10 +19,10 @@ from cosim.records.record import NO_RENDERER
 from cosim.records.run_folder import RunFolder, RunSpec
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite
-from physics.cameras.choice import chosen as chosen_camera
+from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from scenarios.builders.fits import check_places
-from scenarios.catalog import chosen, load_suite
+from scenarios.catalog import load_suite, scenarios_chosen
 from scenarios.execution.asked import Patience
 from scenarios.execution.pool import run_all
 
@@ -54,7 +54,7 @@ def run(
         print(table[["scenario", "success", "route_completion"]])
     """
     whole = load_suite(suite) if isinstance(suite, str) else suite
-    picked = chosen(whole, scenarios, episodes, events)
+    picked = scenarios_chosen(whole, scenarios, episodes, events)
     check_places(whole, picked)
     driver = load_policy(policy) if isinstance(policy, str) else Driver.of(policy)
     if not isinstance(policy, str) and jobs != 1:

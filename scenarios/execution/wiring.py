@@ -19,7 +19,7 @@ from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Barrier, Scenario
-from physics.cameras.choice import camera_of, chosen, renderer_of
+from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.robots import robot
 from physics.street.furniture import Prop, footprints
 from physics.world.world import BulletWorld
@@ -40,7 +40,7 @@ FRONTAGE_M = 2.0
 
 
 @dataclass(slots=True)
-class Stage:
+class StagedScenario:
     """A scenario ready to run. parts: its engines; limits: of the robot. renderer: what draws for the policy. known:
     all that the simulator knows at a moment. eyes: makes further cameras. injected: takes pedestrians in. entrances:
     who comes and goes in the street."""
@@ -62,7 +62,7 @@ def staged(
     options: EpisodeOptions,
     clock: Clock,
     waiting: Callable[[str], None],
-) -> Iterator[Stage]:
+) -> Iterator[StagedScenario]:
     """Start every engine of a scenario; all are closed at the end, whatever happened."""
     _, street_map = place(scenario.place)
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
@@ -74,18 +74,18 @@ def staged(
         crowd = stack.enter_context(crowd_of(scenario))
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
-            return camera_of(chosen(options.camera), world, spec, light=scenario.light)
+            return camera_of(camera_of_choice(options.camera), world, spec, light=scenario.light)
 
         camera, renderer = None, NO_RENDERER
         if manifest.camera is not None:
-            camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(chosen(options.camera))
+            camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
         director = stack.enter_context(director_of(scenario.id, options.director, waiting))
         director = among_residents(director, scenario, street_map, world.ground, lambda: crowd.street.people)
         injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
         footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
         free = shapely.buffer(footing, -world.footprint_m[1] / 2)
         shapely.prepare(free)
-        yield Stage(
+        yield StagedScenario(
             parts=Parts(world, crowd, injected, camera),
             limits=Limits(),
             renderer=renderer,

@@ -35,7 +35,7 @@ from scenarios.execution.messages import (
     Waits,
     decode_hello,
     decode_job,
-    encode,
+    encode_message,
 )
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ REPORT_EVERY_TICKS = 20
 CANNOT_START = "an environment process cannot start:"
 
 
-def main(pipe_descriptor: int, asked_descriptor: int) -> None:
+def serve_jobs(pipe_descriptor: int, asked_descriptor: int) -> None:
     """Serve jobs until the pipe closes. An exception outside an episode ends the process; its parent starts anew."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     pipe, home = Connection(pipe_descriptor), Path.cwd()
@@ -153,6 +153,6 @@ def watcher(job: Job, pipe: Connection) -> Watch:
 def send(pipe: Connection, message: Message) -> None:
     """Say something to the run. When it is gone this process ends at once: that is no crash of the episode."""
     try:
-        pipe.send_bytes(encode(message))
+        pipe.send_bytes(encode_message(message))
     except OSError:
         os._exit(1)

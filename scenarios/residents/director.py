@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import People
 from cosim.episode.ports import Director
-from cosim.people.steering import NEAR_M, Neighbour
+from cosim.people.steering import STEERING_NEAR_M, Neighbour
 from cosim.place.street_map import StreetMap
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Scenario
@@ -27,24 +27,24 @@ from scenarios.residents.graph import BehaviorGraph, behavior_graph
 from scenarios.residents.resident import (
     SPEED_MPS,
     Resident,
-    actor_of,
-    advanced,
     arrived,
     bound_for,
-    chosen,
     drawn_spot,
     drawn_waypoint,
+    next_errand,
+    resident_actor,
+    resident_moved_on,
     wants_to_choose,
 )
-from sumo_nets.crowd.demand import CLEAR_M, SIGHT_M
+from sumo_nets.crowd.demand import FIRST_FILL_CLEAR_M, SIGHT_M
 
 WITHIN_M: Final = 60.0
 """Residents appear no farther from the robot."""
 GONE_M: Final = 70.0
 """Beyond this they are gone."""
-ROLL_TICKS: Final = 10
+_ROLL_TICKS: Final = 10
 """How often they come and go."""
-ROOM_M: Final = 1.5
+_ROOM_M: Final = 1.5
 """Nobody appears nearer to somebody."""
 SETTLED: Final = 0.5
 """How likely somebody who appears is busy already, where there is something to do."""
@@ -84,22 +84,22 @@ class Residents:
         reply = self._director.react(query)
         people = self._people()
         self._advance(query, people)
-        if query.tick % ROLL_TICKS == 0:
+        if query.tick % _ROLL_TICKS == 0:
             self._roll(query, people)
         if not self._here:
             return reply
-        return msgspec.structs.replace(reply, actors=(*reply.actors, *map(actor_of, self._here.values())))
+        return msgspec.structs.replace(reply, actors=(*reply.actors, *map(resident_actor, self._here.values())))
 
     def _advance(self, query: EventQuery, people: People) -> None:
         robot = Neighbour(query.robot_x_m, query.robot_y_m, *_velocity(query.robot_v_mps, query.robot_heading_rad))
         for number, resident in list(self._here.items()):
             if wants_to_choose(resident, query):
                 taken = {one.goal for one in self._here.values() if one.number != number}
-                resident = chosen(resident, self._graph, self._rng(number, resident.choices), taken)
+                resident = next_errand(resident, self._graph, self._rng(number, resident.choices), taken)
             self._here[number] = resident
         around = _around([one for one in self._here.values() if one.phase == "walking"], people)
         for number, resident in list(self._here.items()):
-            self._here[number] = advanced(resident, self._graph, query, (robot, *around.get(number, ())))
+            self._here[number] = resident_moved_on(resident, self._graph, query, (robot, *around.get(number, ())))
 
     def _roll(self, query: EventQuery, people: People) -> None:
         robot = np.array([query.robot_x_m, query.robot_y_m])
@@ -109,7 +109,7 @@ class Residents:
         if len(self._here) >= self._count or not len(self._graph):
             return
         away = np.hypot(*(self._graph.xy - robot).T)
-        nearest = SIGHT_M if query.tick else CLEAR_M
+        nearest = SIGHT_M if query.tick else FIRST_FILL_CLEAR_M
         ring = (away >= nearest) & (away <= WITHIN_M)
         ring[[one.goal for one in self._here.values()]] = False
         for _ in range(self._count - len(self._here)):
@@ -129,7 +129,7 @@ class Residents:
         settled = node is not None
         if node is None:
             node = drawn_waypoint(graph, ring, rng, ())
-        if node is None or (np.hypot(*(others - graph.xy[node]).T) < ROOM_M).any():
+        if node is None or (np.hypot(*(others - graph.xy[node]).T) < _ROOM_M).any():
             return None
         x, y = graph.xy[node].tolist()
         spot = graph.spot(node)
@@ -138,7 +138,7 @@ class Residents:
         if settled:
             one = arrived(bound_for(one, graph, node, rng), graph)
             return one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
-        return chosen(one, graph, rng, {other.goal for other in self._here.values()})
+        return next_errand(one, graph, rng, {other.goal for other in self._here.values()})
 
     def _rng(self, number: int, choice: int) -> np.random.Generator:
         return np.random.default_rng([self._seed, _KIND, number, choice])
@@ -152,7 +152,7 @@ def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neigh
     apart = people.xy[None] - at[:, None]
     square = np.einsum("ijk,ijk->ij", apart, apart)
     found: dict[int, list[tuple[float, Neighbour]]] = {one.number: [] for one in walking}
-    for k, i in np.argwhere(square < NEAR_M**2).tolist():
+    for k, i in np.argwhere(square < STEERING_NEAR_M**2).tolist():
         if people.ids[i] != walking[k].name:
             moving = _velocity(float(people.speed[i]), float(people.heading[i]))
             x, y = people.xy[i].tolist()

@@ -26,13 +26,13 @@ from cosim.place import overlay
 from cosim.place.street_map import Corner, Lane, StreetMap, Strip, union_closed
 from cosim.spec.scenario import Barrier
 from physics.street.furniture import footprints
-from physics.street.interaction_spots import Spot, What, spots
+from physics.street.interaction_spots import InteractionSpot, What, spots
 from physics.street.placement import CLEAR_HALF_M
 from physics.world.ground import Ground
 from physics.world.tiles import key_at
 from scenarios.builders.barriers import outline
 
-REACH_M: Final = 55.0
+_REACH_M: Final = 55.0
 """The graph covers the sidewalks this near to the route."""
 SPACING_M: Final = 4.0
 """From waypoint to waypoint along a sidewalk."""
@@ -63,7 +63,7 @@ class BehaviorGraph:
 
     xy: Floats
     idle: NDArray[np.bool_]
-    spots: tuple[Spot, ...]
+    spots: tuple[InteractionSpot, ...]
     arcs: csr_array
     part: NDArray[np.int32]
     ground: shapely.Geometry
@@ -75,7 +75,7 @@ class BehaviorGraph:
     def __len__(self) -> int:
         return len(self.xy)
 
-    def spot(self, node: int) -> Spot | None:
+    def spot(self, node: int) -> InteractionSpot | None:
         """What there is to do at a node; None at a waypoint."""
         return self.spots[node - self.waypoints] if node >= self.waypoints else None
 
@@ -131,7 +131,7 @@ def behavior_graph(
     street_map: StreetMap, ground: Ground, route: Sequence[tuple[float, float]], barriers: Sequence[Barrier] = ()
 ) -> BehaviorGraph:
     """The graph of the streets around a route."""
-    area = shapely.buffer(LineString(route), REACH_M)
+    area = shapely.buffer(LineString(route), _REACH_M)
     strips = [
         s for s in street_map.near("strip", area)
         if isinstance(s, Strip) and s.kind == "sidewalk" and s.going == "plain" and s.length_m > 2.0
@@ -165,7 +165,7 @@ def behavior_graph(
 def _joined(
     xy: Floats,
     idle: NDArray[np.bool_],
-    found: list[Spot],
+    found: list[InteractionSpot],
     ends: NDArray[np.intp],
     footing: shapely.Geometry,
     open_ground: shapely.Geometry,
@@ -211,13 +211,13 @@ def _middles(corners: Sequence[Corner], footing: shapely.Geometry) -> Floats:
 
 
 def _places(
-    offered: Sequence[Spot],
+    offered: Sequence[InteractionSpot],
     xy: Floats,
     open_ground: shapely.Geometry,
     footing: shapely.Geometry,
     strips: Sequence[Strip],
     things: Sequence[shapely.Geometry],
-) -> tuple[list[Spot], NDArray[np.intp]]:
+) -> tuple[list[InteractionSpot], NDArray[np.intp]]:
     """The spots where somebody fits, beside the middle of the sidewalk, in sight of the thing, and the waypoint of
     each; one for each seat or window."""
     if not offered or not len(xy):
@@ -232,7 +232,7 @@ def _places(
         short = np.array(offered[i].at_m) + 0.1 * (at[i] - offered[i].at_m)
         fits[i] = not len(stands.query(LineString([at[i], short]), predicate="intersects"))
     tree = cKDTree(xy)
-    found: dict[str, tuple[Spot, int]] = {}
+    found: dict[str, tuple[InteractionSpot, int]] = {}
     for i in np.flatnonzero(fits).tolist():
         if offered[i].thing in found:
             continue

@@ -17,7 +17,7 @@ from shapely.geometry import LineString
 
 from cosim.core.geometry import wrap_angle
 from cosim.core.state import Doing
-from cosim.people.steering import LEAST_M, Neighbour, Vector, steered
+from cosim.people.steering import SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
 from cosim.people.yielding import stepped_round, within_reach_m
 from cosim.spec.events import Actor, EventQuery
 from scenarios.events.walking import robot_of, turned
@@ -25,18 +25,18 @@ from scenarios.residents.graph import BehaviorGraph
 
 SPEED_MPS: Final = (1.1, 1.65)
 STAYS_S: Final = {"bench": (20.0, 60.0), "window": (5.0, 25.0), "stop": (15.0, 60.0), "idle": (5.0, 20.0)}
-FAR_M: Final = 120.0
+_FAR_M: Final = 120.0
 """Nobody sets out for something that is farther to walk."""
 TO_DO: Final = 0.75
 """How likely one goes to do something rather than to stand about, where there is something to do."""
-APART_M: Final = 1.2
+_APART_M: Final = 1.2
 """Nobody chooses to stand nearer to somebody who stands; two sit on a bench."""
 ACCELERATION_MPS2: Final = 3.0
 ARRIVES_M: Final = 0.04
 PASSES_M: Final = 0.3
 """So near to a waypoint one goes on to the next."""
 LOOKS_AHEAD_TICKS: Final = 8
-GIVES_UP_S: Final = 3.0
+_GIVES_UP_S: Final = 3.0
 """Who makes no way for so long goes elsewhere."""
 TREADS_MPS: Final = 0.25
 """What a body shows that turns on the spot: `cosim.people.gait` blends from it into what it does next."""
@@ -76,7 +76,7 @@ class Resident(NamedTuple):
         return f"n{self.number}"
 
 
-def actor_of(resident: Resident) -> Actor:
+def resident_actor(resident: Resident) -> Actor:
     """The resident as the world shows it."""
     here = resident.phase != "walking" and resident.since_tick is not None
     return Actor(
@@ -93,18 +93,18 @@ def actor_of(resident: Resident) -> Actor:
 def wants_to_choose(resident: Resident, query: EventQuery) -> bool:
     """Whether it is done here, or makes no way."""
     if resident.phase == "walking":
-        return resident.blocked_ticks * query.tick_ms / 1000 >= GIVES_UP_S
+        return resident.blocked_ticks * query.tick_ms / 1000 >= _GIVES_UP_S
     return _here_s(resident, query) >= resident.stay_s + LEAVES_S
 
 
-def chosen(resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]) -> Resident:
+def next_errand(resident: Resident, graph: BehaviorGraph, rng: np.random.Generator, taken: Collection[int]) -> Resident:
     """The resident on its way to something new. taken: nodes where others are or go to."""
     node = graph.nearest(resident.x_m, resident.y_m)
     resident = resident._replace(blocked_ticks=0, choices=resident.choices + 1, since_tick=None, phase="walking")
     if node is None:
         return resident
     distance, _ = graph.distances(node)
-    within = (distance > 0.0) & (distance < FAR_M)
+    within = (distance > 0.0) & (distance < _FAR_M)
     within[sorted({*taken, resident.goal})] = False
     goal = drawn_spot(graph, within, rng) if rng.random() < TO_DO else None
     if goal is None:
@@ -130,7 +130,7 @@ def drawn_waypoint(
     not; None without either."""
     open_to = open_to[: graph.waypoints].copy()
     for x, y in graph.xy[sorted(taken)].tolist():
-        open_to &= np.hypot(*(graph.xy[: graph.waypoints] - (x, y)).T) > APART_M
+        open_to &= np.hypot(*(graph.xy[: graph.waypoints] - (x, y)).T) > _APART_M
     aside = open_to & graph.idle
     nodes = np.flatnonzero(aside if aside.any() else open_to)
     return int(nodes[int(rng.integers(len(nodes)))]) if len(nodes) else None
@@ -149,7 +149,9 @@ def bound_for(resident: Resident, graph: BehaviorGraph, goal: int, rng: np.rando
     return resident._replace(goal=goal, doing=doing, stay_s=stay_s)
 
 
-def advanced(resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]) -> Resident:
+def resident_moved_on(
+    resident: Resident, graph: BehaviorGraph, query: EventQuery, neighbours: Sequence[Neighbour]
+) -> Resident:
     """One tick on."""
     if resident.phase == "walking":
         return _walked(resident, graph, query, neighbours)
@@ -252,7 +254,7 @@ def _stepped(
 def _nearer(at: Vector, onward: Vector, one: Neighbour) -> bool:
     """Whether a step leads nearer to somebody who is too near."""
     far_m = math.hypot(onward[0] - one.x_m, onward[1] - one.y_m)
-    return far_m < LEAST_M and far_m < math.hypot(at[0] - one.x_m, at[1] - one.y_m)
+    return far_m < SHOULDER_TO_SHOULDER_M and far_m < math.hypot(at[0] - one.x_m, at[1] - one.y_m)
 
 
 def _here_s(resident: Resident, query: EventQuery) -> float:

@@ -18,17 +18,18 @@ from cosim.core.geometry import Floats, wrap_angles
 from cosim.episode.log import Log
 from cosim.records.record import Record
 from cosim.records.run_folder import read_records
-from cosim.spec.events import Event, Kind
+from cosim.spec.events import Event, EventName
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.events import frontal, lateral, overtaking, standing
 
-TRIGGERS_M: Final[Mapping[Kind, float]] = MappingProxyType(
+TRIGGERS_M: Final[Mapping[EventName, float]] = MappingProxyType(
     {
-        "obstructing": standing.TRIGGER_M, "conversing": standing.TRIGGER_M, "queueing": standing.TRIGGER_M,
-        "gesturing": standing.TRIGGER_M, "frontal": frontal.TRIGGER_M, "lateral": lateral.TRIGGER_M,
-        "overtaking": -overtaking.TRIGGER_M,
+        **dict.fromkeys(("obstructing", "conversing", "queueing", "gesturing"), standing.STANDING_TRIGGER_M),
+        "frontal": frontal.FRONTAL_TRIGGER_M,
+        "lateral": lateral.LATERAL_TRIGGER_M,
+        "overtaking": -overtaking.OVERTAKING_TRIGGER_M,
     }
-)  # fmt: skip
+)
 """Where the robot is when an event triggers: metres before its place (negative: beyond it); `ped_crossing` at the edge
 of its crosswalk."""
 
@@ -114,8 +115,8 @@ def summary(sheet: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
                 "n": part["scenario"].str.split().str[0].nunique(),
                 "people": len(part),
                 "stated": stated.get(str(kind), "entry"),
-                "trigger m": spread(part["trigger_m"]),
-                "error m": spread(part["error_m"]),
+                "trigger m": _spread(part["trigger_m"]),
+                "error m": _spread(part["error_m"]),
                 "tick m": f"{part['period_m'].max():.3f}",
                 "off": str(int((part["error_m"] > part["period_m"] + LATE_M).sum())),
             }
@@ -123,17 +124,17 @@ def summary(sheet: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
         walks.append(
             {
                 "event": kind,
-                "m/s": spread(part["speed_mps"]),
-                "stated m/s": spread(part["stated_mps"]),
-                "left m": spread(part["left_m"]),
-                "|angle| deg": spread(part["angle_deg"].abs(), 0),
-                "least m": spread(part["least_m"]),
+                "m/s": _spread(part["speed_mps"]),
+                "stated m/s": _spread(part["stated_mps"]),
+                "left m": _spread(part["left_m"]),
+                "|angle| deg": _spread(part["angle_deg"].abs(), 0),
+                "least m": _spread(part["least_m"]),
             }
         )
     return pd.DataFrame(triggers), pd.DataFrame(walks)
 
 
-def spread(values: pd.Series[float] | Sequence[float], digits: int = 2) -> str:
+def _spread(values: pd.Series[float] | Sequence[float], digits: int = 2) -> str:
     """Least and largest of what is there; "-" for nothing."""
     known = pd.Series(values).dropna()
     if not len(known):

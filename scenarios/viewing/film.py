@@ -31,7 +31,7 @@ from cosim.spec.options import CameraChoice
 from cosim.spec.scenario import Scenario
 from scenarios.execution.places import place
 from scenarios.execution.replay import Alike, check, recorded, replaying
-from scenarios.viewing.look import View, behind, over
+from scenarios.viewing.look import Viewpoint, eye_behind, over
 
 EASE_S: Final = 0.5
 """The follower's heading lags the robot's by about this much."""
@@ -39,12 +39,12 @@ SMALLEST_PX: Final = (320, 180)
 ROBOT_FOV_DEG: Final = 75.0
 """Of the robot's camera, up and down, at 4:3; wider pictures show no more to the sides."""
 ROBOT_ASIDE: Final = math.tan(math.radians(ROBOT_FOV_DEG / 2)) * 4.0 / 3.0
-FOV_DEG: Final = 62.0
+_FOV_DEG: Final = 62.0
 """Of the views from behind and from above, up and down."""
 ABOVE_REST: Final = (2.0, 0.0, 10.0)
 """From above, when nothing happens: metres ahead and to the left of the robot that are looked at, height of the eye."""
 ABOVE_HIGH_M: Final = (6.5, 12.0)
-NEAR_M: Final = 8.0
+_NEAR_M: Final = 8.0
 """Event people this near are kept in the picture from above."""
 
 
@@ -57,10 +57,10 @@ class Cut(NamedTuple):
     size: tuple[int, int] = (1280, 720)
     speed: int = 1
     camera: CameraChoice = "auto"
-    view: View = "follow"
+    view: Viewpoint = "follow"
 
 
-def film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
+def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:
     """Write the film of a finished episode; the simulated second at which it ends, infinite for the episode's end.
 
     Raises RunError when there is no such episode, or when the replay differs; then there is no file.
@@ -164,13 +164,13 @@ class _Reel:
             hud.caption(image, layout.view, *self._caption)
         return image
 
-    def _outside(self, view: View, area: hud.Area, robot: RobotState, street: Street) -> Image:
+    def _outside(self, view: Viewpoint, area: hud.Area, robot: RobotState, street: Street) -> Image:
         """What somebody sees who follows the robot, behind it or above it."""
         if view == "follow":
-            eye, target = behind(robot, self._ahead)
+            eye, target = eye_behind(robot, self._ahead)
         else:
             eye, target = over(robot, self._ahead, self._over)
-        return self._camera.picture(eye, target, street, robot, (area.width, area.height), FOV_DEG).rgb
+        return self._camera.picture(eye, target, street, robot, (area.width, area.height), _FOV_DEG).rgb
 
     def _note(self, step: Step, verdict: Verdict) -> None:
         """Count failures, and choose what is captioned."""
@@ -195,7 +195,7 @@ def _framed(robot: RobotState, street: Street) -> Floats:
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     event = [name.startswith("e") for name in street.people.ids]
     offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])
-    near = offset[np.hypot(*offset.T) < NEAR_M]
+    near = offset[np.hypot(*offset.T) < _NEAR_M]
     if not len(near):
         return np.array(ABOVE_REST)
     every = np.vstack([near, (0.0, 0.0)])

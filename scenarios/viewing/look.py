@@ -20,21 +20,21 @@ from cosim.spec.scenario import Scenario
 from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
 
-View = Literal["robot", "follow", "above"]
-VIEWS: Final[tuple[View, ...]] = ("robot", "follow", "above")
+Viewpoint = Literal["robot", "follow", "above"]
+VIEWS: Final[tuple[Viewpoint, ...]] = ("robot", "follow", "above")
 BEHIND_M: Final = 4.6
 ABOVE_M: Final = 2.5
-AHEAD_M: Final = 3.0
+_AHEAD_M: Final = 3.0
 HIGH_M: Final = 24.0
 OVER_SLANT: Final = 0.22
 """From above the eye is behind what it looks at by this share of its height: little, or a house may stand between."""
 
 
-def look(
+def look_at(
     scenario: Scenario,
     policy: str,
     at_s: float,
-    view: View,
+    view: Viewpoint,
     size: tuple[int, int],
     camera_name: CameraChoice = "auto",
     tell: Tell = untold,
@@ -62,14 +62,14 @@ def look(
         tell("drawing")
         if view == "robot":
             return camera.render(robot, street).rgb, episode.time_s
-        eye, target = behind(robot) if view == "follow" else over(robot)
+        eye, target = eye_behind(robot) if view == "follow" else over(robot)
         return camera.picture(eye, target, street, robot, size).rgb, episode.time_s
 
 
-def behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
+def eye_behind(robot: RobotState, ahead: Floats | None = None) -> tuple[Floats, Floats]:
     """(eye, target), (3,) metres: behind and above the robot, looking ahead. ahead: (2,), by default its heading."""
     way, foot = _way(robot, ahead), robot.pose.xy
-    return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(foot + AHEAD_M * way, robot.z_m + 0.5)
+    return np.append(foot - BEHIND_M * way, robot.z_m + ABOVE_M), np.append(foot + _AHEAD_M * way, robot.z_m + 0.5)
 
 
 def over(

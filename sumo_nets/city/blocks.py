@@ -16,7 +16,7 @@ import numpy as np
 Point = tuple[float, float]
 Line = list[Point]
 
-STEP_M = 6.0
+_STEP_M = 6.0
 """Spacing of the points of a curved line."""
 
 
@@ -80,7 +80,7 @@ class StreetClass(NamedTuple):
         )
 
 
-STRIPE_M = 0.64
+WALKWAY_STRIPE_M = 0.64
 """Width of the stripes in which SUMO's walkers keep: walkways are an odd number of them wide."""
 
 CLASSES = {
@@ -128,7 +128,7 @@ def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
     """From a, leaving with heading `leave_rad`, to b, arriving with heading `arrive_rad`: a cubic Bezier."""
     handle = math.dist(a, b) / 3.0
     c, d = polar(a, handle, leave_rad), polar(b, -handle, arrive_rad)
-    count = max(4, math.ceil(math.dist(a, b) / STEP_M))
+    count = max(4, math.ceil(math.dist(a, b) / _STEP_M))
     line = []
     for i in range(count + 1):
         t = i / count
@@ -165,7 +165,7 @@ def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:
 
 def arc(centre: Point, radius_m: float, from_rad: float, turn_rad: float) -> Line:
     """A circular arc that starts at the angle `from_rad` and runs through `turn_rad`, left positive."""
-    count = max(4, math.ceil(radius_m * abs(turn_rad) / (STEP_M / 2.0)))
+    count = max(4, math.ceil(radius_m * abs(turn_rad) / (_STEP_M / 2.0)))
     return [polar(centre, radius_m, from_rad + turn_rad * i / count) for i in range(count + 1)]
 
 

@@ -34,8 +34,8 @@ STRAIGHT_RAD = math.radians(8.0)
 FORK_RAD = math.radians(152.0)
 """Three arms are a Y when no two of them are farther apart than this, else a T."""
 
-CLEAR_M = 1.2
-LONGEST_M = 1500.0
+LEAST_CLEAR_M = 1.2
+_LONGEST_M = 1500.0
 ONE_PIECE = 0.99
 
 
@@ -257,8 +257,8 @@ def _faults(found: Census, place: StreetMap, signals: Sequence[str]) -> list[str
         faults.append(f"only {found.one_piece:.1%} of the walkable area is one piece")
     if loose:
         faults.append(f"{loose} strips end at no corner")
-    if found.clear_m < CLEAR_M:
+    if found.clear_m < LEAST_CLEAR_M:
         faults.append(f"a passage is only {found.clear_m:.2f} m wide")
-    if found.km2 > 3.0 and found.longest_m < LONGEST_M:
+    if found.km2 > 3.0 and found.longest_m < _LONGEST_M:
         faults.append(f"the longest walk has only {found.longest_m:.0f} m")
     return [*faults, *signals]

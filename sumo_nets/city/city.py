@@ -19,17 +19,17 @@ from sumo_nets.city.blocks import CLASSES
 from sumo_nets.city.draft import Cell, Draft, Link
 from sumo_nets.city.plan import CityPlan, plan_of
 
-SIZE_M = (CITY_SIZE_M.low, CITY_SIZE_M.high)
+_SIZE_M = (CITY_SIZE_M.low, CITY_SIZE_M.high)
 """Smallest and largest city."""
 PITCH_M = (102.0, 126.0)
-MARGIN_M = 22.0
+_MARGIN_M = 22.0
 ROUNDABOUT_BLOCKS = 70
 """At least one roundabout for so many blocks."""
 CLEAR_RAD = math.radians(58.0)
 """Smallest angle between two arms of a junction."""
 
 
-class Style(NamedTuple):
+class _Style(NamedTuple):
     """Shares of what cities are made of, on average; classes: weight of each street class among rows and columns."""
 
     classes: dict[str, float]
@@ -48,9 +48,9 @@ DOWNTOWN = {"residential": 0.1, "commercial": 0.4, "avenue": 0.3, "boulevard": 0
 SUBURB = {"residential": 0.74, "commercial": 0.08, "avenue": 0.1, "narrow": 0.08}
 
 STYLES = {
-    "mixed": Style(MIXED, 0.25, 0.13, 0.04, 0.45, 0.35, 0.10, 0.12, 0.25),
-    "downtown": Style(DOWNTOWN, 0.10, 0.08, 0.02, 0.15, 0.08, 0.03, 0.05, 0.35),
-    "suburb": Style(SUBURB, 0.28, 0.18, 0.05, 0.55, 0.55, 0.15, 0.15, 0.15),
+    "mixed": _Style(MIXED, 0.25, 0.13, 0.04, 0.45, 0.35, 0.10, 0.12, 0.25),
+    "downtown": _Style(DOWNTOWN, 0.10, 0.08, 0.02, 0.15, 0.08, 0.03, 0.05, 0.35),
+    "suburb": _Style(SUBURB, 0.28, 0.18, 0.05, 0.55, 0.55, 0.15, 0.15, 0.15),
 }
 
 PURPOSES = (
@@ -74,8 +74,8 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
     """The plan of a city; equal to the bit for equal arguments. Raises MapError for a size out of range."""
     if style not in STYLES:
         raise unknown("city style", style, STYLES)
-    if not SIZE_M[0] <= size_m <= SIZE_M[1]:
-        raise MapError(f"a city's size_m must be in [{SIZE_M[0]:g}, {SIZE_M[1]:g}], not {size_m:g}")
+    if not _SIZE_M[0] <= size_m <= _SIZE_M[1]:
+        raise MapError(f"a city's size_m must be in [{_SIZE_M[0]:g}, {_SIZE_M[1]:g}], not {size_m:g}")
     if seed < 0:
         raise MapError(f"a city's seed cannot be negative: {seed}")
     entropy = (seed, round(size_m * 100), sorted(STYLES).index(style))
@@ -91,12 +91,12 @@ def plan_city(seed: int, size_m: float, style: str) -> CityPlan:
     return plan_of(draft, rngs, made_of.crosswalks)
 
 
-def _character(rng: np.random.Generator, style: Style) -> tuple[Style, float]:
+def _character(rng: np.random.Generator, style: _Style) -> tuple[_Style, float]:
     """What one city of a style is made of, and how far apart its streets are: cities differ as a whole too."""
     classes = {name: weight * float(rng.uniform(0.4, 1.6)) for name, weight in style.classes.items()}
     shares = [share * float(rng.uniform(0.6, 1.4)) for share in style[2:]]
     jitter = style.jitter * float(rng.uniform(0.5, 1.1))
-    return Style(classes, jitter, *shares), float(rng.uniform(*PITCH_M))
+    return _Style(classes, jitter, *shares), float(rng.uniform(*PITCH_M))
 
 
 def _lattice(
@@ -105,9 +105,9 @@ def _lattice(
     width_rng: np.random.Generator,
     size_m: float,
     pitch_m: float,
-    style: Style,
+    style: _Style,
 ) -> Draft:
-    cells = max(2, round((size_m - 2.0 * MARGIN_M) / pitch_m))
+    cells = max(2, round((size_m - 2.0 * _MARGIN_M) / pitch_m))
     xs, ys = (_spaced(rng, cells, size_m) for _ in range(2))
     sway = style.jitter * (min(b - a for line in (xs, ys) for a, b in pairwise(line)) - 55.0)
     wave_x, wave_y = (_Wave.draw(rng, size_m) for _ in range(2))
@@ -128,11 +128,11 @@ def _lattice(
 
 def _spaced(rng: np.random.Generator, cells: int, size_m: float) -> list[float]:
     """Where the rows or columns lie: unevenly, but never so close that a block has no room."""
-    pitch = (size_m - 2.0 * MARGIN_M) / cells
+    pitch = (size_m - 2.0 * _MARGIN_M) / cells
     loose = max(0.0, 0.6 * (pitch - 75.0))
     gaps = [pitch + float(rng.uniform(-loose, loose)) for _ in range(cells)]
-    scale = (size_m - 2.0 * MARGIN_M) / sum(gaps)
-    return [MARGIN_M + scale * sum(gaps[:k]) for k in range(cells + 1)]
+    scale = (size_m - 2.0 * _MARGIN_M) / sum(gaps)
+    return [_MARGIN_M + scale * sum(gaps[:k]) for k in range(cells + 1)]
 
 
 class _Wave(NamedTuple):
@@ -149,7 +149,7 @@ class _Wave(NamedTuple):
 
     def shift(self, along_m: float, across_m: float, size_m: float) -> float:
         """How far a point moves along one axis."""
-        inside = math.sin(math.pi * (along_m - MARGIN_M) / (size_m - 2.0 * MARGIN_M))
+        inside = math.sin(math.pi * (along_m - _MARGIN_M) / (size_m - 2.0 * _MARGIN_M))
         return self.height_m * inside * math.sin(2.0 * math.pi * across_m / self.length_m + self.phase_rad)
 
 
@@ -240,7 +240,7 @@ def _dissolve(draft: Draft) -> None:
         draft.links.remove(two)
 
 
-def _bend_streets(draft: Draft, rng: np.random.Generator, style: Style) -> None:
+def _bend_streets(draft: Draft, rng: np.random.Generator, style: _Style) -> None:
     """Y junctions, curves and S-bends, each only where every angle between arms stays wide."""
     arms = draft.arms()
     for cell, mine in arms.items():

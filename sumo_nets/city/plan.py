@@ -62,7 +62,7 @@ class Zebra(NamedTuple):
     width_m: float
 
 
-class Ring(NamedTuple):
+class _Ring(NamedTuple):
     """A roundabout's nodes and edges."""
 
     nodes: tuple[str, ...]
@@ -76,7 +76,7 @@ class CityPlan:
     nodes: tuple[Node, ...]
     edges: tuple[Edge, ...]
     zebras: tuple[Zebra, ...]
-    rings: tuple[Ring, ...]
+    rings: tuple[_Ring, ...]
     signal_rng: np.random.Generator
 
 
@@ -86,7 +86,7 @@ class _Parts:
 
     nodes: dict[str, Node]
     edges: list[Edge]
-    rings: list[Ring]
+    rings: list[_Ring]
     joints: dict[tuple[Cell, int], Node]
     zebras: dict[str, list[Zebra]]
 
@@ -130,7 +130,7 @@ def _add_ring(
     parts.nodes |= {node.id: node for node in around}
     parts.joints |= {(cell, number): node for (_, number), node in zip(order, around, strict=True)}
     parts.edges += arcs
-    parts.rings.append(Ring(tuple(n.id for n in around), tuple(e.id for e in arcs)))
+    parts.rings.append(_Ring(tuple(n.id for n in around), tuple(e.id for e in arcs)))
 
 
 def _add_street(

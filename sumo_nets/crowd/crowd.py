@@ -24,7 +24,7 @@ from cosim.core.geometry import Floats, Pose, headings_from_sumo
 from cosim.core.state import People, RobotState, Street, Vehicles
 from cosim.episode.ports import Crowd
 from cosim.people.gait import Strides
-from cosim.people.yielding import Body
+from cosim.people.yielding import RobotBody
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
@@ -33,17 +33,17 @@ from sumo_nets.crowd.demand_log import DRIVERS, PEDESTRIANS, Entrances, Kept
 from sumo_nets.crowd.demand_replay import replayed_demand
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.lights import Signals
-from sumo_nets.crowd.pose_filter import STANDING_MPS, PoseFilter
+from sumo_nets.crowd.pose_filter import PERSON_STANDS_MPS, PoseFilter
 from sumo_nets.crowd.proxy import Proxy, Walks
 from sumo_nets.crowd.waiting_spots import Kerbs
 
 TICK_MS = 50
 """One step of SUMO."""
 
-ROLL_TICKS = 10
+_ROLL_TICKS = 10
 """How often persons and vehicles come and go."""
 
-WARM_UP_S = 8.0
+_WARM_UP_S = 8.0
 """How long the vehicles drive before the first tick; persons walk at once."""
 
 SIGNAL_CLOCK_S = 3600
@@ -137,7 +137,7 @@ class SumoCrowd(Crowd):
         with _translated(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
             libsumo.poi.setPosition(EYE, x_m, y_m)
-            if tick % ROLL_TICKS == 0:
+            if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._pedestrians.roll(x_m, y_m, _seen(libsumo.person, persons), self._waits_at_red)
                 self._drivers.roll(x_m, y_m, _seen(libsumo.vehicle, vehicles))
@@ -145,7 +145,7 @@ class SumoCrowd(Crowd):
                 self._robot.update(robot.pose)
             self._mirror(reply.actors)
             libsumo.simulationStep()
-            body = None if absent else Body(robot.pose, self._half_m, robot.v_mps)
+            body = None if absent else RobotBody(robot.pose, self._half_m, robot.v_mps)
             self._street = self._read(tick + 1, x_m, y_m, reply.actors, body)
         return self._street
 
@@ -182,7 +182,7 @@ class SumoCrowd(Crowd):
         self._watch(x_m, y_m)
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
-            for _ in range(round(WARM_UP_S * 1000 / TICK_MS)):
+            for _ in range(round(_WARM_UP_S * 1000 / TICK_MS)):
                 libsumo.simulationStep()
         self._pedestrians.fill(x_m, y_m)
         libsumo.simulationStep()
@@ -219,7 +219,7 @@ class SumoCrowd(Crowd):
                 self._actors[actor.id] = Proxy(libsumo, self._walks, base=actor.id, kind="event", serial=self._serial)
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
-    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: Body | None) -> Street:
+    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: RobotBody | None) -> Street:
         found: dict[str, Row] = libsumo.poi.getContextSubscriptionResults(EYE)
         here = sorted(name for name, row in found.items() if row[tc.VAR_POSITION][0] > NOWHERE_M)
         persons, vehicles = ({name: found[name] for name in here if name[0] == kind} for kind in "cv")
@@ -227,7 +227,7 @@ class SumoCrowd(Crowd):
         people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
-    def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...], body: Body | None) -> People:
+    def _people(self, persons: dict[str, Row], actors: tuple[Actor, ...], body: RobotBody | None) -> People:
         ids = tuple(persons)
         xy, speed = _column(persons, tc.VAR_POSITION, 2), _column(persons, tc.VAR_SPEED)
         for i, row in enumerate(persons.values()):
@@ -245,7 +245,7 @@ class SumoCrowd(Crowd):
             places,
             np.concatenate([heading, [a.heading_rad for a in cast]]),
             speeds,
-            (*("walk" if fast else "stand" for fast in (speed > STANDING_MPS).tolist()), *(a.doing for a in cast)),
+            (*("walk" if fast else "stand" for fast in (speed > PERSON_STANDS_MPS).tolist()), *(a.doing for a in cast)),
             *self._strides.update(names, places, paces),
         )
 

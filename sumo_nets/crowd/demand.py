@@ -19,15 +19,15 @@ from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.group_sampling import STRIPE_M, Companies
-from sumo_nets.crowd.proxy import END_M, KEEP_ROUTE, MATCH_M
+from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, Companies
+from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
 from sumo_nets.crowd.room import Room
-from sumo_nets.crowd.spots import Spot, Spots
+from sumo_nets.crowd.spots import EntrySpot, Spots
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
 
-CLEAR_M = 8.0
+FIRST_FILL_CLEAR_M = 8.0
 """In the first fill, when nobody watches yet, nobody appears nearer than this."""
 
 ENTER_M = 40.0
@@ -39,9 +39,9 @@ LINGER_M = 20.0
 STUCK_S = 60.0
 """A person that has waited this long, but not at a red light, is taken out."""
 
-EDGE_M = 0.4
-PERSONAL_SPACE_M = 1.5
-WALK_EDGES = 30
+_EDGE_M = 0.4
+_PERSONAL_SPACE_M = 1.5
+_WALK_EDGES = 30
 BARRIER_MARGIN_M = 1.0
 PERSONS_AT_ONCE = 8
 
@@ -99,7 +99,7 @@ class Pedestrians:
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Everybody at once, before the episode."""
-        self._enter(self.wanted(x_m, y_m), x_m, y_m, CLEAR_M, {})
+        self._enter(self.wanted(x_m, y_m), x_m, y_m, FIRST_FILL_CLEAR_M, {})
 
     def wanted(self, x_m: float, y_m: float) -> int:
         """How many persons there should be within the crowd's radius of a point."""
@@ -145,7 +145,7 @@ class Pedestrians:
                 self._engine.person.remove(fellow)
 
     def _margin_m(self, port: Port) -> float:
-        return self._widths_m[port.strip] + END_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
+        return self._widths_m[port.strip] + ROUND_THE_CORNER_M + (BARRIER_MARGIN_M if port in self._closed else 0.0)
 
     def _enter(self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]) -> None:
         if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
@@ -158,15 +158,15 @@ class Pedestrians:
             spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
             forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*company.pace_mps))
             width_m = self._widths_m[spot.edge]
-            half_m = max(width_m / 2 - EDGE_M - (company.abreast(width_m) - 1) * STRIPE_M / 2, 0.0)
+            half_m = max(width_m / 2 - _EDGE_M - (company.abreast(width_m) - 1) * GROUP_STRIPE_M / 2, 0.0)
             middle_m = float(self._rng.uniform(-half_m, half_m))
             back = -1.0 if forward else 1.0
             places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in company.places(width_m)]
             if any(
-                np.hypot(x - other_x, y - other_y) < PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
+                np.hypot(x - other_x, y - other_y) < _PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
             ):
                 continue
-            walk = self._graph.wander(self._rng, spot.edge, forward, WALK_EDGES, self._closed)
+            walk = self._graph.wander(self._rng, spot.edge, forward, _WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
             walk, speed_mps = self._one_way(walk, forward), company.walks_at(drawn_mps)
@@ -197,7 +197,7 @@ class Pedestrians:
         self._count += 1
         return f"c{self._count - 1}"
 
-    def _add(self, name: str, spot: Spot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
+    def _add(self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
         """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
         self._engine.person.add(name, spot.edge, spot.share * first_m)

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 READS: Final = ("get", "subscribe")
 """Calls of SUMO that begin so change nothing."""
-KEPT: Final = ("person", "vehicle", "route")
+_KEPT: Final = ("person", "vehicle", "route")
 ADDS: Final = "add"
 PEDESTRIANS: Final = "pedestrians"
 DRIVERS: Final = "drivers"
@@ -52,7 +52,7 @@ class Kept:
 
     def __init__(self, engine: Any, entrances: Entrances, whose: str) -> None:
         self._engine, self._entrances, self._whose = engine, entrances, whose
-        for domain in KEPT:
+        for domain in _KEPT:
             setattr(self, domain, _KeptDomain(self, domain, getattr(engine, domain)))
 
     def __getattr__(self, name: str) -> Any:
@@ -82,11 +82,11 @@ class _KeptDomain:
 
 def again(engine: Any, entrances: Entrances, whose: str) -> None:
     """Make the calls that somebody made at this time. What is about one who is not there any more is left out."""
-    domains = {name: getattr(engine, name) for name in KEPT}
+    domains = {name: getattr(engine, name) for name in _KEPT}
     calls = entrances.at(whose, engine.simulation.getTime())
     if not calls:
         return
-    here = {name: set(domains[name].getIDList()) for name in KEPT}
+    here = {name: set(domains[name].getIDList()) for name in _KEPT}
     for call in calls:
         name = str(call.arguments[0])
         if call.name == ADDS:

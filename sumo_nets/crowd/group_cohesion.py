@@ -19,9 +19,9 @@ import numpy as np
 from cosim.core.geometry import heading_to_sumo
 from cosim.place.street_map import Strip
 from sumo_nets.crowd.group_sampling import PERSON_MPS
-from sumo_nets.crowd.proxy import END_M, KEEP_ROUTE, MATCH_M
+from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
 
-SLACK_M: Final = 0.15
+_SLACK_M: Final = 0.15
 """Nobody cares to be so little ahead or behind."""
 
 SLOWER_PER_M: Final = 0.3
@@ -30,35 +30,35 @@ SLOWER_PER_M: Final = 0.3
 SLOWEST, FASTEST = 0.6, 1.1
 """Shares of the group's speed within which its members vary; nobody hurries beyond the fastest walkers' speed."""
 
-STEPS: Final = 20.0
+_STEPS: Final = 20.0
 """Shares change in twentieths: small changes are not worth a call."""
 
 WAIT_M, GO_M = 2.0, 1.4
 """Who is so far ahead of the last waits, until the last is nearer than GO_M."""
 
-BESIDE_M: Final = 1.0
+_BESIDE_M: Final = 1.0
 """Who is farther to the side of the next fellow steps nearer."""
 
-STEP_M: Final = 0.34
+_STEP_M: Final = 0.34
 """A step to the side: more than half a stripe, so that SUMO leads on to the middle of the next one."""
 
-ROOM_M, AHEAD_M = 0.9, 6.0
+_ROOM_M, _AHEAD_M = 0.9, 6.0
 """Nobody steps to the side where somebody would be so near, or comes towards it from so far ahead."""
 
 ROUGHLY: Final = 0.5
 """On corners, where the way turns, what lies between fellows along it counts by this much."""
 
-APART_M: Final = 3.0
+_APART_M: Final = 3.0
 """Of fellows farther apart, who may be round a corner, the edges that they walk on say who is ahead."""
 
 LOOK_AHEAD: Final = 6
 """Nobody walks over so many edges between two looks."""
 
-MOVED_M: Final = 0.1
+_MOVED_M: Final = 0.1
 """Who has moved less since the last look does not say where the group goes."""
 
 
-Place = tuple[float, float]
+_Place = tuple[float, float]
 """Where somebody is or where a way leads: x, y in metres."""
 
 
@@ -68,9 +68,9 @@ class _Group:
     mps: float
     walk: Sequence[str]
     at: int = 0
-    way: Place | None = None
+    way: _Place | None = None
     wide: bool = False
-    was: Mapping[str, Place] = field(default_factory=dict)
+    was: Mapping[str, _Place] = field(default_factory=dict)
     ahead_m: dict[str, float] = field(default_factory=dict)
     share: dict[str, float] = field(default_factory=dict)
 
@@ -84,7 +84,7 @@ class Together:
     def __init__(self, engine: Any, strips: Mapping[str, Strip], tick_s: float) -> None:
         self._engine, self._strips, self._tick_s = engine, strips, tick_s
         self._groups: dict[str, _Group] = {}
-        self._chords: dict[str, Place] = {}
+        self._chords: dict[str, _Place] = {}
 
     @property
     def groups(self) -> tuple[tuple[str, ...], ...]:
@@ -133,26 +133,26 @@ class Together:
     def _pull(self, group: _Group) -> None:
         """Make the speeds of who is ahead and who lags."""
         last_m, first_m = min(group.ahead_m.values()), max(group.ahead_m.values())
-        if first_m - last_m <= SLACK_M and not group.share:
+        if first_m - last_m <= _SLACK_M and not group.share:
             return
         middle_m = sum(group.ahead_m.values()) / len(group.ahead_m)
         for name, ahead_m in group.ahead_m.items():
             share = 1.0
             if ahead_m - last_m > (GO_M if group.share.get(name) == 0.0 else WAIT_M):
                 share = 0.0
-            elif abs(ahead_m - middle_m) > SLACK_M:
+            elif abs(ahead_m - middle_m) > _SLACK_M:
                 share = min(max(1.0 - SLOWER_PER_M * (ahead_m - middle_m), SLOWEST), FASTEST)
             if share < 1.0 and self._on_crossing(name):
                 share = 1.0
-            self._walk(group, name, round(STEPS * share) / STEPS)
+            self._walk(group, name, round(_STEPS * share) / _STEPS)
 
-    def _close(self, here: Mapping[str, Place], group: _Group, way: Place, seen: Mapping[str, Any]) -> None:
+    def _close(self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, Any]) -> None:
         """Let one who walks too far to the side, and did before, step nearer to its fellows; of two the hindmost."""
         left = sorted((way[0] * y_m - way[1] * x_m, name) for name, (x_m, y_m) in here.items())
         too_wide = [
             (one, other)
             for (low_m, one), (high_m, other) in itertools.pairwise(left)
-            if BESIDE_M < high_m - low_m < APART_M and 0.0 not in (group.share.get(one), group.share.get(other))
+            if _BESIDE_M < high_m - low_m < _APART_M and 0.0 not in (group.share.get(one), group.share.get(other))
         ]
         before, group.wide = group.wide, bool(too_wide)
         if not too_wide or not before:
@@ -161,18 +161,18 @@ class Together:
         others = [(p.x_m, p.y_m) for name, p in seen.items() if name not in here]
         for name in sorted(too_wide[0], key=lambda name: (group.ahead_m[name], name)):
             on_m = self._tick_s * group.mps * group.share.get(name, 1.0)
-            left_m = STEP_M if name == too_wide[0][0] else -STEP_M
+            left_m = _STEP_M if name == too_wide[0][0] else -_STEP_M
             to = (here[name][0] + on_m * way[0] - left_m * way[1], here[name][1] + on_m * way[1] + left_m * way[0])
             if _is_free(to, way, others) and self._step(name, way, to):
                 return
 
-    def _step(self, name: str, way: Place, to: Place) -> bool:
+    def _step(self, name: str, way: _Place, to: _Place) -> bool:
         """A step to the side, while walking along a sidewalk."""
         person = self._engine.person
         strip = self._strips.get(person.getRoadID(name))
-        if strip is None or strip.kind != "sidewalk" or person.getSpeed(name) < MOVED_M:
+        if strip is None or strip.kind != "sidewalk" or person.getSpeed(name) < _MOVED_M:
             return False
-        length_m, margin_m = self._engine.lane.getLength(f"{strip.id}_0"), strip.width_m + END_M
+        length_m, margin_m = self._engine.lane.getLength(f"{strip.id}_0"), strip.width_m + ROUND_THE_CORNER_M
         if not margin_m < person.getLanePosition(name) < length_m - margin_m:
             return False
         person.moveToXY(name, "", *to, heading_to_sumo(math.atan2(way[1], way[0])), KEEP_ROUTE, MATCH_M)
@@ -182,26 +182,26 @@ class Together:
         strip = self._strips.get(self._engine.person.getRoadID(name))
         return strip is not None and strip.kind == "crossing"
 
-    def _order(self, here: Mapping[str, Place], group: _Group) -> None:
+    def _order(self, here: Mapping[str, _Place], group: _Group) -> None:
         """Where the group goes, and how far along that way each is."""
         self._come_to(group)
         x_m = y_m = 0.0
         for name, (now_x_m, now_y_m) in here.items():
             was_x_m, was_y_m = group.was.get(name, (now_x_m, now_y_m))
-            if abs(now_x_m - was_x_m) + abs(now_y_m - was_y_m) > MOVED_M:
+            if abs(now_x_m - was_x_m) + abs(now_y_m - was_y_m) > _MOVED_M:
                 x_m, y_m = x_m + now_x_m - was_x_m, y_m + now_y_m - was_y_m
         group.was = here
         far_m = math.hypot(x_m, y_m)
-        if far_m > MOVED_M:
+        if far_m > _MOVED_M:
             group.way = (x_m / far_m, y_m / far_m)
         if group.way is None:
             return
         ahead_m = {n: group.way[0] * p[0] + group.way[1] * p[1] for n, p in here.items()}
-        if max(ahead_m.values()) - min(ahead_m.values()) > SLACK_M:
+        if max(ahead_m.values()) - min(ahead_m.values()) > _SLACK_M:
             ahead_m = self._along(group.names, group.way) or self._round_a_corner(here, ahead_m, group)
         group.ahead_m = ahead_m
 
-    def _along(self, names: tuple[str, ...], way: Place) -> dict[str, float] | None:
+    def _along(self, names: tuple[str, ...], way: _Place) -> dict[str, float] | None:
         """How far along its line each is, if all are on one sidewalk or crossing: exact even where somebody evades."""
         person = self._engine.person
         edges = {person.getRoadID(name) for name in names}
@@ -215,10 +215,10 @@ class Together:
         return {name: sign * person.getLanePosition(name) for name in names}
 
     def _round_a_corner(
-        self, here: Mapping[str, Place], ahead_m: Mapping[str, float], group: _Group
+        self, here: Mapping[str, _Place], ahead_m: Mapping[str, float], group: _Group
     ) -> dict[str, float]:
         """Who is ahead by how much where the way turns, or on several edges: roughly, but by the walk if APART_M."""
-        if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < APART_M:
+        if max(math.dist(p, q) for p, q in itertools.combinations(here.values(), 2)) < _APART_M:
             return {name: ROUGHLY * m for name, m in ahead_m.items()}
         edges = {name: self._edge(name, group) for name in here}
         hindmost = [here[name] for name, edge in edges.items() if edge == min(edges.values())]
@@ -248,9 +248,9 @@ class Together:
             self._engine.person.setSpeed(name, fastest_mps if share > 1.0 else group.mps * share)
 
 
-def _is_free(place: Place, way: Place, others: list[Place]) -> bool:
+def _is_free(place: _Place, way: _Place, others: list[_Place]) -> bool:
     """Whether nobody is near a place, nor in the way for AHEAD_M from there on."""
     apart = np.array(others).reshape(-1, 2) - place
     ahead, aside = apart @ way, apart @ (-way[1], way[0])
     behind = np.minimum(ahead, 0.0)
-    return not bool(((ahead < AHEAD_M) & (np.hypot(behind, aside) < ROOM_M)).any())
+    return not bool(((ahead < _AHEAD_M) & (np.hypot(behind, aside) < _ROOM_M)).any())

@@ -16,7 +16,7 @@ import numpy as np
 from cosim.spec.scenario import CrowdSpec
 
 PERSON_MPS: Final = (1.1, 1.65)
-SLOW_MPS: Final = (0.8, 1.1)
+SLOWEST_GROUP_MPS: Final = (0.8, 1.1)
 """Elderly people and children with their adults: those of them who walk outside PERSON_MPS."""
 
 SLOWER_MPS: Final = 0.04
@@ -25,7 +25,7 @@ SLOWER_MPS: Final = 0.04
 TRIO_SHARE: Final = 0.25
 """Of groups, how many are of three. Moussaid's counts fall with the size as a Poisson distribution does."""
 
-STRIPE_M: Final = 0.64
+GROUP_STRIPE_M: Final = 0.64
 """How far beside each other people walk: a stripe of SUMO's. On narrower ways some walk behind, ROW_M."""
 
 ROW_M: Final = 0.8
@@ -47,13 +47,13 @@ class Company(NamedTuple):
 
     def abreast(self, width_m: float) -> int:
         """How many of it walk beside each other on a way so wide."""
-        return max(min(self.size, int(width_m / STRIPE_M + 1e-6)), 1)
+        return max(min(self.size, int(width_m / GROUP_STRIPE_M + 1e-6)), 1)
 
     def places(self, width_m: float) -> list[tuple[float, float]]:
         """How far to the left of its middle, and how far behind its front, each walks on a way so wide, in metres."""
         abreast = self.abreast(width_m)
         rows = [min(abreast, self.size - first) for first in range(0, self.size, abreast)]
-        return [(STRIPE_M * (k - (n - 1) / 2), ROW_M * row) for row, n in enumerate(rows) for k in range(n)]
+        return [(GROUP_STRIPE_M * (k - (n - 1) / 2), ROW_M * row) for row, n in enumerate(rows) for k in range(n)]
 
 
 class Companies:
@@ -87,7 +87,7 @@ class Companies:
             return Company(("",) * size)
         if size > 1 and family < self._family:
             children = size - 1 if second < 0.5 else 1
-            return Company(("adult",) * (size - children) + ("child",) * children, SLOW_MPS)
+            return Company(("adult",) * (size - children) + ("child",) * children, SLOWEST_GROUP_MPS)
         if elder < self._elder:
-            return Company(("elder",) * size, SLOW_MPS)
+            return Company(("elder",) * size, SLOWEST_GROUP_MPS)
         return Company(("adult",) * size)

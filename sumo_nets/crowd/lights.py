@@ -12,13 +12,13 @@ from scipy.spatial import cKDTree
 from cosim.core.state import Signal
 from cosim.place.street_map import StreetMap
 
-NEAR_M = 80.0
+_NEAR_M = 80.0
 """The signals of crossings within this distance of the robot are shown."""
 
 RESELECT_M = 5.0
 """How far the robot moves before the near crossings are looked up again."""
 
-WALK = "Gg"
+_WALK = "Gg"
 
 
 class Signals:
@@ -46,7 +46,7 @@ class Signals:
         """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
         if self._centre is None or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
             self._centre = (x_m, y_m)
-            self._near = [self._ids[i] for i in self._tree.query_ball_point((x_m, y_m), NEAR_M, return_sorted=True)]
+            self._near = [self._ids[i] for i in self._tree.query_ball_point((x_m, y_m), _NEAR_M, return_sorted=True)]
         now_s = self._engine.simulation.getTime()
         signals = {}
         for crossing in self._near:
@@ -64,7 +64,7 @@ class Signals:
             light, index = self._link[crossing]
             traffic_light = self._engine.trafficlight
             next_s = traffic_light.getNextSwitch(light)
-            walk = traffic_light.getRedYellowGreenState(light)[index] in WALK
+            walk = traffic_light.getRedYellowGreenState(light)[index] in _WALK
             self._until[crossing] = next_s if self._program(light) else now_s
             self._shown[crossing] = (walk, self._change(light, index, walk, next_s))
         return self._shown[crossing]
@@ -77,7 +77,7 @@ class Signals:
         change_s = next_s
         for k in range(1, len(phases)):
             duration_s, state = phases[(current + k) % len(phases)]
-            if (state[index] in WALK) != walk:
+            if (state[index] in _WALK) != walk:
                 return change_s
             change_s += duration_s
         return None

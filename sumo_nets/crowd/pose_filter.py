@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.rows import Rows
-from cosim.people.yielding import Body, stepped_round
+from cosim.core.rows import RowLookup
+from cosim.people.yielding import RobotBody, stepped_round
 from sumo_nets.crowd.separation import kept_apart
 
 MAX_SPEED_MPS = 2.2
@@ -31,7 +31,7 @@ LOOK_AHEAD_S = 0.3
 TURNING_SPEED_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
 
-STANDING_MPS = 0.1
+PERSON_STANDS_MPS = 0.1
 """Below this SUMO's person stands."""
 
 NOBODY_ELSE: Floats = np.zeros((0, 2))
@@ -42,7 +42,7 @@ class PoseFilter:
     """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on."""
 
     period_s: float
-    _rows: Rows = field(default_factory=Rows)
+    _rows: RowLookup = field(default_factory=RowLookup)
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
@@ -53,7 +53,7 @@ class PoseFilter:
         xy: Floats,
         speed: Floats,
         facing_of: Callable[[str], float],
-        body: Body | None = None,
+        body: RobotBody | None = None,
         others: Floats = NOBODY_ELSE,
     ) -> tuple[Floats, Floats, Floats]:
         """The shown positions (N, 2) m, headings (N,) rad and speeds (N,) m/s, given the simulated ones.
@@ -74,7 +74,7 @@ class PoseFilter:
         distance = np.hypot(gap[:, 0], gap[:, 1])
         reach_m = MAX_SPEED_MPS * self.period_s
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
-        stand = speed < STANDING_MPS
+        stand = speed < PERSON_STANDS_MPS
         shown = self._apart(before, shown, others, stand)
         if body is not None:
             shown = stepped_round(before, shown, body, stand)

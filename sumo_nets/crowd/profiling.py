@@ -7,9 +7,9 @@ from typing import Any
 
 import libsumo
 
-Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
+_Timed = Callable[[str, Callable[..., Any]], Callable[..., Any]]
 
 
-def put_stopwatch(timed: Timed) -> None:
+def put_crowd_stopwatch(timed: _Timed) -> None:
     """Replace SUMO's step by a timed one, for the rest of this process."""
     libsumo.simulationStep = timed("crowd", libsumo.simulationStep)

@@ -24,7 +24,7 @@ KEEP_ROUTE_ON_ROAD = 7
 """The same with car lanes allowed: cars stop for somebody on the carriageway."""
 
 MATCH_M = 100.0
-END_M = 2.0
+ROUND_THE_CORNER_M = 2.0
 """Beyond its width, how near to the end of a sidewalk SUMO may take a proxy to be round the corner."""
 
 NEARER_M = 0.01
@@ -157,7 +157,7 @@ class Walks:
         strip = self.street_map.strips[edge]
         (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
         forward = (x1 - x0) * math.cos(pose.heading_rad) + (y1 - y0) * math.sin(pose.heading_rad) >= 0.0
-        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + END_M
+        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + ROUND_THE_CORNER_M
         return self._meeting(edge, 1 if forward or at_end else 0)
 
 

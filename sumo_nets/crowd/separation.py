@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats
-from cosim.people.steering import LEAST_M
+from cosim.people.steering import SHOULDER_TO_SHOULDER_M
 
-KEEP_M: Final = LEAST_M
+SHOULDERS_M: Final = SHOULDER_TO_SHOULDER_M
 """Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
 
-NEAR_M: Final = 0.6
+_NEAR_M: Final = 0.6
 """Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
 
 ROUNDS: Final = 8
@@ -97,12 +97,12 @@ def _pairs(xy: Floats, firm: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArr
     nobody = np.zeros(0, dtype=np.intp)
     if len(xy) < 2:
         return nobody, nobody
-    pairs = cKDTree(xy).query_pairs(NEAR_M, output_type="ndarray")
+    pairs = cKDTree(xy).query_pairs(_NEAR_M, output_type="ndarray")
     if not len(pairs):
         return nobody, nobody
     one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
     gap = xy[one] - xy[other]
-    close = (gap * gap).sum(axis=1) < KEEP_M * KEEP_M
+    close = (gap * gap).sum(axis=1) < SHOULDERS_M * SHOULDERS_M
     moves = ~(firm[one] & firm[other])
     return (one[moves], other[moves]) if (close & moves).any() else (nobody, nobody)
 
@@ -120,7 +120,7 @@ def _push(apart: Complex, before: Complex, bend: Complex) -> tuple[Complex, floa
     apart, before: (K,) from the first of each pair to the second, now and at the beginning of the step.
     """
     far = np.abs(apart)
-    lost = np.maximum(KEEP_M - far, 0.0)
+    lost = np.maximum(SHOULDERS_M - far, 0.0)
     # Two at one place part along the line on which they came.
     line = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
     push: Complex = lost * line / np.abs(line) * bend

@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from cosim.core.geometry import Floats, Polyline, Pose
 
 
-class Spot(NamedTuple):
+class EntrySpot(NamedTuple):
     """A place on the middle line of an edge, heading along it; share: of the edge's length that lies before it."""
 
     edge: str
@@ -51,5 +51,5 @@ class Spots:
         near: list[int] = hits[np.hypot(gap[:, 0], gap[:, 1]) >= low_m].tolist()
         return near
 
-    def __getitem__(self, number: int) -> Spot:
-        return Spot(self._edges[number], float(self._shares[number]), Pose(*self._poses[number].tolist()))
+    def __getitem__(self, number: int) -> EntrySpot:
+        return EntrySpot(self._edges[number], float(self._shares[number]), Pose(*self._poses[number].tolist()))

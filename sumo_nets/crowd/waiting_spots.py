@@ -14,7 +14,7 @@ from shapely.geometry import Point
 from cosim.place import overlay
 from cosim.place.street_map import Lane, StreetMap
 
-ROOM_M: Final = 0.3
+_ROOM_M: Final = 0.3
 
 
 class Kerbs:
@@ -54,7 +54,7 @@ class Kerbs:
             taken = [s.polygon for s in self._map.near("strip", polygon) if s.id.startswith(":")]
             taken += [s.polygon for s in self._map.near("lane", polygon) if isinstance(s, Lane) and s.kind == "road"]
             free = overlay.difference(polygon, overlay.union_all(taken)) if taken else polygon
-            ground = shapely.buffer(free, -ROOM_M)
+            ground = shapely.buffer(free, -_ROOM_M)
             shapely.prepare(ground)
             self._ground[corner] = ground
         return self._ground[corner]

@@ -22,8 +22,8 @@ CLEAR_M = 0.36
 """Half the width that must be free on the way through a corner."""
 PAD_M = 0.5
 """Radius of the ground added at a port of a mended corner."""
-WIDEST_M = 2.0
-EDGE_M = 0.05
+_WIDEST_M = 2.0
+_EDGE_M = 0.05
 
 
 def mend_corners(root: ET.Element, street_map: StreetMap) -> list[str]:
@@ -59,7 +59,7 @@ def passable(street_map: StreetMap, corner: Corner) -> Polygon | None:
     pairs = combinations(range(len(ports)), 2)
     for i, k in sorted(pairs, key=lambda pair: float(np.hypot(*(ends[pair[0]] - ends[pair[1]])))):
         if groups[i] != groups[k]:
-            width_m = max(2.0 * clear_m + 0.1, min(float(widths[i]), float(widths[k]), WIDEST_M))
+            width_m = max(2.0 * clear_m + 0.1, min(float(widths[i]), float(widths[k]), _WIDEST_M))
             bands.append(_band(ends[i], ends[k], width_m))
             old = groups[k]
             groups = [groups[i] if group == old else group for group in groups]
@@ -75,7 +75,7 @@ def _end(port: Port, strip: Strip) -> Floats:
 def _beside(corner: Corner, strip: Strip, end: Floats) -> bool:
     """Whether a strip's end lies at the edge of the ground rather than on it."""
     ground = union_closed([corner.polygon, strip.polygon])
-    return float(shapely.distance(shapely.boundary(ground), shapely.Point(end))) < EDGE_M
+    return float(shapely.distance(shapely.boundary(ground), shapely.Point(end))) < _EDGE_M
 
 
 def _open(

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-Box = tuple[float, float, float, float]
+_Box = tuple[float, float, float, float]
 
-LEFT_HAND: dict[str, tuple[Box, ...]] = {
+LEFT_HAND: dict[str, tuple[_Box, ...]] = {
     "United Kingdom and Ireland": (
         (-10.8, 49.85, -1.0, 61.0),
         (-1.1, 50.6, 0.9, 61.0),

@@ -14,7 +14,7 @@ from shapely.geometry import Polygon
 from cosim.core.errors import MapError
 from cosim.place.street_map import Feature, FeatureKind
 
-SCHEMA = 1
+_SCHEMA = 1
 NAME = "features.json"
 
 
@@ -35,15 +35,15 @@ class _Kept(msgspec.Struct, frozen=True):
 def write_features(features: Sequence[Feature], path: Path) -> None:
     """Keep features at `path`."""
     rows = [_Row(f.kind, f.x_m, f.y_m, f.heading_rad, f.height_m, _rings(f.polygon)) for f in features]
-    path.write_bytes(msgspec.json.encode(_Kept(SCHEMA, rows)))
+    path.write_bytes(msgspec.json.encode(_Kept(_SCHEMA, rows)))
 
 
 def read_features(path: Path) -> tuple[Feature, ...]:
     """The features at `path`; none when there is no such file. Raises MapError when it is broken."""
     try:
         kept = msgspec.json.decode(path.read_bytes(), type=_Kept)
-        if kept.schema != SCHEMA:
-            raise ValueError(f"schema {kept.schema}; this version reads {SCHEMA}")
+        if kept.schema != _SCHEMA:
+            raise ValueError(f"schema {kept.schema}; this version reads {_SCHEMA}")
         return tuple(_feature(row) for row in kept.features)
     except FileNotFoundError:
         return ()

@@ -28,17 +28,17 @@ EXTENT_M: Final[Mapping[str, tuple[float, float]]] = {
 }  # fmt: skip
 """Length and depth of the ground that each thing may cover."""
 
-CLEAR_HALF_M: Final = 0.6
-EDGE_M: Final = 0.6
+_CLEAR_HALF_M: Final = 0.6
+_EDGE_M: Final = 0.6
 """Along the middle of a sidewalk a band stays clear: 1.2 m wide at least, and all but its outer 0.6 m."""
-WALL_M: Final = 0.2
+WALL_GAP_M: Final = 0.2
 """Least distance of a building from anything walked or driven on."""
-GAP_M: Final = 0.1
-MOVED_M: Final = 3.0
+_GAP_M: Final = 0.1
+_MOVED_M: Final = 3.0
 """Things are moved up to so far to where they may stand."""
 _CELL_M: Final = 2.5
 """Side of the cells in which things look for others: no two that touch are farther apart."""
-FAR_M: Final = 100.0
+_FAR_M: Final = 100.0
 """What is farther from every walkway is left out."""
 IN_ZONE_DEG: Final = 10.0
 """What is farther from the middle of the net's UTM zone is no part of the map."""
@@ -84,7 +84,7 @@ def _near(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
     if not walked or not mapped:
         return []
     outlines = [shapely.LineString(t.rings[0]) if len(t.rings[0]) > 1 else Point(t.rings[0][0]) for t in mapped]
-    hit, _ = shapely.STRtree(walked).query(outlines, predicate="dwithin", distance=FAR_M)
+    hit, _ = shapely.STRtree(walked).query(outlines, predicate="dwithin", distance=_FAR_M)
     return [mapped[i] for i in np.unique(hit)]
 
 
@@ -107,7 +107,7 @@ class _Streets:
 
     def closed(self, at: Point) -> shapely.Geometry:
         """Where nothing may stand, around a point."""
-        return self._closed.union(at, 2.0 * MOVED_M)
+        return self._closed.union(at, 2.0 * _MOVED_M)
 
     def heading(self, kind: str, at: Point | Polygon) -> float:
         """How a thing stands there: a lamp's arm over the road, a bench facing the walk, a building's front to the
@@ -153,7 +153,7 @@ def _band(strip: Strip) -> shapely.Geometry:
     """The part of a strip where nothing may stand: all of a crossing and more, the middle of a sidewalk."""
     if strip.kind == "crossing":
         return shapely.buffer(strip.polygon, 1.0)
-    half = max(CLEAR_HALF_M, 0.5 * strip.width_m - EDGE_M)
+    half = max(_CLEAR_HALF_M, 0.5 * strip.width_m - _EDGE_M)
     if half >= 0.5 * strip.width_m:
         return strip.polygon
     return shapely.buffer(shapely.LineString(strip.line[:, :2]), half)
@@ -169,7 +169,7 @@ def _cut_back(mapped: Sequence[Mapped], streets: _Streets) -> tuple[list[Feature
             dropped += 1  # valid in degrees, and too thin for metres
             continue
         parts = [whole]
-        taken = streets.under(shapely.buffer(whole, WALL_M))
+        taken = streets.under(shapely.buffer(whole, WALL_GAP_M))
         if not shapely.is_empty(taken):
             parts = _without(whole, taken)
             left = sum(part.area for part in parts) > LEFT_SHARE * whole.area
@@ -200,7 +200,7 @@ def _front(part: Polygon, heading_rad: float) -> float:
 
 def _without(whole: Polygon, taken: shapely.Geometry) -> list[Polygon]:
     """What is left of a building off the streets, splinters left out."""
-    ground = shapely.buffer(taken, WALL_M, join_style="mitre", mitre_limit=2.0)
+    ground = shapely.buffer(taken, WALL_GAP_M, join_style="mitre", mitre_limit=2.0)
     left = shapely.simplify(overlay.difference(whole, ground), 0.05)
     left = shapely.buffer(shapely.buffer(left, -0.3, join_style="mitre"), 0.3, join_style="mitre", mitre_limit=2.0)
     # Mitres may reach out again, and corners lie on the centimetre in the file.
@@ -219,7 +219,7 @@ def _settled(
     for thing in mapped:
         radius = 0.5 * math.hypot(*EXTENT_M[thing.kind])
         spot = Point(thing.rings[0][0])
-        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * MOVED_M))
+        closed = overlay.union(streets.closed(spot), houses.union(spot, 2.0 * _MOVED_M))
         at = _free_spot(spot, closed, radius)
         if at is None:
             counts["left out on a road, a crossing or in a narrow passage"] += 1
@@ -227,7 +227,7 @@ def _settled(
         xy = np.array([round(at.x, 2), round(at.y, 2)])
         i, j = (math.floor(c / _CELL_M) for c in xy)
         rivals = [rival for a in (-1, 0, 1) for b in (-1, 0, 1) for rival in stood.get((i + a, j + b), ())]
-        if any(np.hypot(*(xy - other)) < radius + reach + GAP_M for other, reach in rivals):
+        if any(np.hypot(*(xy - other)) < radius + reach + _GAP_M for other, reach in rivals):
             counts["left out where another one stands"] += 1
             continue
         if at is not spot:
@@ -247,4 +247,4 @@ def _free_spot(spot: Point, closed: shapely.Geometry, radius_m: float) -> Point 
         return spot
     edge = shapely.boundary(shapely.buffer(closed, radius_m + 0.02))
     _, at = (Point(p) for p in shapely.get_coordinates(shapely.shortest_line(spot, edge)))
-    return at if spot.distance(at) <= MOVED_M else None
+    return at if spot.distance(at) <= _MOVED_M else None

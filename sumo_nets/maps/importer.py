@@ -18,7 +18,7 @@ import shapely
 
 from cosim.core.errors import MachineError, MapError, UsageError
 from cosim.place.map_check import NetFacts
-from cosim.place.overlay import place_of
+from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Feature
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
@@ -32,7 +32,7 @@ from sumo_nets.net.netfile import read_net
 
 TIMEOUT_S = 300.0
 START_TIMEOUT_S = 60.0
-Box = tuple[float, float, float, float]
+_Box = tuple[float, float, float, float]
 
 TYPES = ("osmNetconvert.typ.xml", "osmNetconvertUrbanDe.typ.xml", "osmNetconvertPedestrians.typ.xml")
 OSM_OPTIONS = (
@@ -70,7 +70,7 @@ class Options:
     projection. lefthand: None to look it up.
     """
 
-    bbox: Box | None = None
+    bbox: _Box | None = None
     lefthand: bool | None = None
     upgrade: bool = False
 
@@ -208,7 +208,7 @@ def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     return facts
 
 
-def _crop(file: MapFile, folder: Path, net: Path, bbox: Box | None, changes: list[str]) -> Path:
+def _crop(file: MapFile, folder: Path, net: Path, bbox: _Box | None, changes: list[str]) -> Path:
     """The net inside a box, in two calls: both wishes in one keep netconvert busy for ever on some nets."""
     if bbox is None:
         return net
@@ -331,7 +331,9 @@ def _told_of(file: MapFile) -> Iterator[None]:
     except KeyError as error:
         raise MapError(f"{file.source}: not a street net that can be read: attribute {error} is missing") from error
     except shapely.errors.GEOSException as error:
-        raise MapError(f"{file.source}: its ground{place_of(error)} cannot be put together: {error}") from error
+        raise MapError(
+            f"{file.source}: its ground{where_geos_failed(error)} cannot be put together: {error}"
+        ) from error
     except (ValueError, IndexError) as error:
         raise MapError(f"{file.source}: not a street net that can be read: {error}") from error
 

@@ -19,8 +19,8 @@ from shapely.geometry import Polygon
 from cosim.core.geometry import Floats
 from sumo_nets.maps.osmfile import MapFile, scanned
 
-STOREY_M = 3.2
-LOWEST_M, HIGHEST_M = 2.5, 150.0
+_STOREY_M = 3.2
+LOWEST_M, HIGHEST_BUILDING_M = 2.5, 150.0
 """Heights of buildings are kept within these."""
 ABSURD_M = 1000.0
 SMALLEST_DEG2, LARGEST_DEG2 = 1e-10, 1e-4
@@ -45,12 +45,12 @@ FLAT = ("no", "roof", "ruins", "construction", "proposed", "foundation", "collap
 """Values of building=* that have no walls."""
 LOW = ("garage", "garages", "shed", "hut", "carport", "kiosk", "container", "cabin", "bungalow", "greenhouse")
 LEVELS_OF = {"house": 2.0, "detached": 2.0, "semidetached_house": 2.0, "terrace": 2.0}
-LEVELS = 3.0
+_LEVELS = 3.0
 """Storeys of a building of which nothing is said."""
 SMALL_M2 = 40.0
 """Less than this on the ground has one storey: kiosks, sheds, advertising columns."""
 METRE_DEG = 1.0 / 111_195.0
-NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
+_NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
 WINDS = ("N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW")
 
 
@@ -232,11 +232,11 @@ def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
 
 def building_height_m(tags: Mapping[str, str], area_m2: float, skipped: Counter[str]) -> float:
     """Height of a building: as said, else by its storeys, else by kind and size; within LOWEST_M and HIGHEST_M."""
-    said = _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * STOREY_M
+    said = _height(tags, "height", skipped) or _height(tags, "building:levels", skipped) * _STOREY_M
     if not said:
         kind = tags.get("building", "yes")
-        said = STOREY_M * (1.0 if kind in LOW or area_m2 < SMALL_M2 else LEVELS_OF.get(kind, LEVELS))
-    return min(max(said, LOWEST_M), HIGHEST_M)
+        said = _STOREY_M * (1.0 if kind in LOW or area_m2 < SMALL_M2 else LEVELS_OF.get(kind, _LEVELS))
+    return min(max(said, LOWEST_M), HIGHEST_BUILDING_M)
 
 
 def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
@@ -253,10 +253,10 @@ def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
 def _metres(words: str) -> float | None:
     """A number with or without a unit of length in metres ("12", "12.5 m", "12,5", "40'", "40 ft"); None for others."""
     text = words.strip().lower().replace(",", ".")
-    feet = re.fullmatch(rf"({NUMBER.pattern})\s*(?:'|ft|feet)(?:\s*({NUMBER.pattern})\s*(?:\"|in))?", text)
+    feet = re.fullmatch(rf"({_NUMBER.pattern})\s*(?:'|ft|feet)(?:\s*({_NUMBER.pattern})\s*(?:\"|in))?", text)
     if feet:
         return 0.3048 * (float(feet[1]) + float(feet[2] or 0.0) / 12.0)
-    plain = re.fullmatch(rf"({NUMBER.pattern})\s*(?:m|metres?|meters?)?", text)
+    plain = re.fullmatch(rf"({_NUMBER.pattern})\s*(?:m|metres?|meters?)?", text)
     return float(plain[1]) if plain else None
 
 
@@ -265,7 +265,7 @@ def _facing(tags: Mapping[str, str]) -> float | None:
     text = tags.get("direction", "").strip().upper()
     if text in WINDS:
         degrees = 360.0 * WINDS.index(text) / len(WINDS)
-    elif NUMBER.fullmatch(text):
+    elif _NUMBER.fullmatch(text):
         degrees = float(text)
     else:
         return None

@@ -22,8 +22,8 @@ ON_FOOT = frozenset(("footway", "path", "pedestrian", "steps", "living_street", 
 FAST = frozenset(("motorway", "motorway_link", "trunk", "trunk_link"))
 NO_STREET = frozenset(("construction", "proposed", "raceway", "bus_guideway", "platform", "rest_area", "services"))
 
-MOST_LANES, WIDEST_M = 40, 200
-NUMBER = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?")
+MOST_LANES, _WIDEST_M = 40, 200
+_NUMBER = re.compile(r"\d+(?:\.\d*)?(?:[eE]\+?\d+)?")
 
 Format = Literal["net", "osm"]
 
@@ -168,10 +168,10 @@ def _check_numbers(way: str, tags: dict[str, str]) -> None:
         if words[0] == "lanes":
             most = MOST_LANES
         elif "width" in (words[0], words[-1]):
-            most = WIDEST_M
+            most = _WIDEST_M
         else:
             continue
-        if any(float(number) > most for number in NUMBER.findall(said)):
+        if any(float(number) > most for number in _NUMBER.findall(said)):
             raise ValueError(f"way {way}: {key}={said[:40]}, but no street has more than {most}: mend the tag")
 
 

@@ -51,7 +51,7 @@ def head_of(path: Path) -> bytes:
 
 def pour(source: Path, packing: str, target: Path) -> None:
     """Write `source`, unpacked, to `target`. Raises MapError when it is broken, too large or no XML."""
-    with pieces(source, packing) as unpacked:
+    with file_pieces(source, packing) as unpacked:
         try:
             with target.open("wb") as out:
                 for piece in unpacked:
@@ -64,14 +64,14 @@ def net_bytes(path: Path) -> bytes:
     """A .net.xml or .net.xml.gz as XML. Raises MapError when it cannot be read."""
     packing = "gzip" if head_of(path)[:2] == b"\x1f\x8b" else ""
     whole = io.BytesIO()
-    with pieces(path, packing) as unpacked:
+    with file_pieces(path, packing) as unpacked:
         for piece in unpacked:
             whole.write(piece)
     return whole.getvalue()
 
 
 @contextmanager
-def pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
+def file_pieces(source: Path, packing: str) -> Iterator[Iterator[bytes]]:
     """The content of a file, piece by piece. packing: "", "gzip" or "bzip2"."""
     try:
         with OPENERS[packing](source) as stream:

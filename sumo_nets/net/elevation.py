@@ -23,12 +23,12 @@ from scipy.spatial import cKDTree
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Corner, Strip
 from cosim.place.terrain import CLAMPED_M, FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
-from sumo_nets.net.profile import SAME_LEVEL_M, Course, Meeting, On, Profile, along, course, what_lies_there
+from sumo_nets.net.profile import SAME_LEVEL_M, Course, Meeting, On, Profile, course, metres_along, what_lies_there
 
-STEP_M: Final = 2.0
+_SAMPLE_M: Final = 2.0
 NODES_MAX: Final = 6_000_000
 """Larger places get a coarser lattice."""
-MARGIN_M: Final = 80.0
+_MARGIN_M: Final = 80.0
 KNOWN_SHARE: Final = 0.5
 """With fewer of the points known, an elevation is a guess."""
 FALSE_SHARE: Final = 0.15
@@ -151,9 +151,9 @@ def _steep(terrain: Terrain, lines: Sequence[Floats], half_m: Sequence[float]) -
         shapely.segmentize(shapely.linestrings(np.concatenate(lines), indices=owner), 1.0), return_index=True
     )
     same = owner[1:] == owner[:-1]
-    middle, along, owner = (0.5 * (at[1:] + at[:-1]))[same], np.diff(at, axis=0)[same], owner[1:][same]
-    along /= np.maximum(np.hypot(*along.T), 1e-9)[:, None]
-    aside = np.asarray(half_m)[owner][:, None] * np.column_stack([-along[:, 1], along[:, 0]])
+    middle, metres_along, owner = (0.5 * (at[1:] + at[:-1]))[same], np.diff(at, axis=0)[same], owner[1:][same]
+    metres_along /= np.maximum(np.hypot(*metres_along.T), 1e-9)[:, None]
+    aside = np.asarray(half_m)[owner][:, None] * np.column_stack([-metres_along[:, 1], metres_along[:, 0]])
     steep = [np.hypot(*terrain.gradient(middle + k * aside).T) > ROBOT_GRADE_MAX for k in (-1, 0, 1)]
     return np.asarray(np.bincount(owner, np.any(steep, axis=0), len(lines)) > 0)
 
@@ -196,7 +196,7 @@ def _drop_zeros(points: Floats) -> None:
     zero = points[:, 2] == 0.0
     high = ~zero & np.isfinite(points[:, 2])
     if zero.any() and high.any():
-        at = along(points)
+        at = metres_along(points)
         beside = np.abs(np.interp(at[zero], at[high], points[high, 2]))
         gap = np.abs(at[zero][:, None] - at[high][None]).min(axis=1)
         points[np.flatnonzero(zero)[beside > FALSE_GRADE * gap + _STEP_M], 2] = np.nan
@@ -219,14 +219,14 @@ def _drop_spikes(points: Floats) -> None:
 def _climb(points: Floats) -> float:
     """All that a line rises and falls, for each metre of its length."""
     known = points[np.isfinite(points[:, 2])]
-    run = float(along(known)[-1]) if len(known) else 0.0
+    run = float(metres_along(known)[-1]) if len(known) else 0.0
     return float(np.abs(np.diff(known[:, 2])).sum()) / run if run > 0.0 else 0.0
 
 
 def _spread(nodes: Profile, level: Floats) -> Terrain:
     """The land: around streets at their heights, level across them; smooth between."""
-    low, high = nodes.xy.min(axis=0) - MARGIN_M, nodes.xy.max(axis=0) + MARGIN_M
-    step_m = STEP_M
+    low, high = nodes.xy.min(axis=0) - _MARGIN_M, nodes.xy.max(axis=0) + _MARGIN_M
+    step_m = _SAMPLE_M
     while np.prod((high - low) / step_m + 2.0) > NODES_MAX:
         step_m *= 2.0
     origin = np.floor(low / step_m) * step_m

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from sumo_nets.maps.rawfile import net_bytes
 
-SCHEMA = b"xsi:noNamespaceSchemaLocation"
+_SCHEMA = b"xsi:noNamespaceSchemaLocation"
 
 
 def without_comments(net: bytes) -> bytes:
@@ -25,7 +25,7 @@ def hash_of(data: bytes) -> str:
     """Content hash of a net's XML."""
     bare = without_comments(data)
     # A search for the plain words is far quicker than the pattern that begins with white space.
-    if SCHEMA in bare:
-        pieces = re.split(SCHEMA + rb'="[^"]*"', bare)
+    if _SCHEMA in bare:
+        pieces = re.split(_SCHEMA + rb'="[^"]*"', bare)
         bare = b"".join([piece.rstrip() for piece in pieces[:-1]] + pieces[-1:])
     return hashlib.sha256(bare.replace(b"\r\n", b"\n").strip()).hexdigest()[:16]

@@ -63,7 +63,7 @@ def footway(edge: ET.Element) -> tuple[ET.Element, str] | None:
 
 
 @dataclass(slots=True)
-class Walks:
+class _Walks:
     """Signals of the crossings: never and always green, beyond the end of the program, without a program."""
 
     never: list[str] = field(default_factory=list)
@@ -72,10 +72,10 @@ class Walks:
     no_program: list[str] = field(default_factory=list)
 
 
-def walks_of(root: ET.Element) -> Walks:
+def walks_of(root: ET.Element) -> _Walks:
     """What the signals in use (the last program of each) show the crossings."""
     programs = {logic.get("id", ""): logic for logic in root.iter("tlLogic")}
-    walks = Walks()
+    walks = _Walks()
     for crossing, (signal, link) in crossing_links(root).items():
         if signal not in programs:
             if signal not in walks.no_program:

@@ -20,7 +20,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
-from cosim.place.overlay import place_of
+from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Corner, Junction, Lane, Port, StreetMap, Strip
 from sumo_nets.maps.rawfile import DEEPEST, net_bytes
 from sumo_nets.net.elevation import land_of, steep_ports, steep_strips
@@ -36,7 +36,7 @@ GROUND = ("no", "", "building_passage")
 HEAVY = frozenset(("rail", "rail_electric", "rail_fast", "subway", "ship", "cable_car", "aircraft"))
 TRAMS = frozenset(("tram", "rail_urban"))
 NEEDED = {"edge": ("id",), "lane": ("id", "shape"), "junction": ("id",), "connection": ("from", "to")}
-WIDEST_M = 500.0
+_WIDEST_M = 500.0
 """No lane and no square is wider."""
 
 Attributes = dict[str, str]
@@ -56,7 +56,7 @@ def read_net(path: Path) -> StreetMap:
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
     except shapely.errors.GEOSException as error:
-        raise MapError(f"{path}: its ground{place_of(error)} cannot be put together: {error}") from error
+        raise MapError(f"{path}: its ground{where_geos_failed(error)} cannot be put together: {error}") from error
     except (ValueError, IndexError) as error:
         raise MapError(f"{path}: not a street net that can be read: {error}") from error
 
@@ -207,8 +207,8 @@ def _width_m(lane: Attributes) -> float:
         width_m = float(said)
     except ValueError:
         width_m = math.nan
-    if math.isnan(width_m) or width_m > WIDEST_M:
-        words = f"a width of {width_m:g} m, but none is more than {WIDEST_M:g}" if width_m > WIDEST_M else "no number"
+    if math.isnan(width_m) or width_m > _WIDEST_M:
+        words = f"a width of {width_m:g} m, but none is more than {_WIDEST_M:g}" if width_m > _WIDEST_M else "no number"
         raise ValueError(f"lane '{lane['id']}': width '{said}' is {words}")
     return width_m
 

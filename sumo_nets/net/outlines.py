@@ -11,7 +11,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
 
-SHORTEST_M = 0.1
+_SHORTEST_M = 0.1
 FARTHEST_M = 1e8
 """No point of a map in metres is farther from its origin, which may be that of a projection."""
 
@@ -22,7 +22,7 @@ def polylines(shapes: Sequence[str], names: Sequence[str]) -> list[Floats]:
     lines = np.split(flat, np.cumsum(counts)[:-1])
     for i, line in enumerate(lines):
         if len(line) < 2 or (len(line) == 2 and abs(line[1] - line[0]).sum() < 1e-3):
-            lines[i] = line[0] + np.array([[-SHORTEST_M / 2.0, 0.0], [SHORTEST_M / 2.0, 0.0]])
+            lines[i] = line[0] + np.array([[-_SHORTEST_M / 2.0, 0.0], [_SHORTEST_M / 2.0, 0.0]])
         lines[i].flags.writeable = False
     return lines
 
@@ -73,7 +73,7 @@ def bands(lines: Sequence[Floats], widths: Floats) -> list[Polygon]:
         return []
     owner = np.repeat(np.arange(len(lines)), [len(line) for line in lines])
     centres = shapely.linestrings(np.concatenate(lines), indices=owner)
-    around = shapely.buffer(centres, np.maximum(widths, SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
+    around = shapely.buffer(centres, np.maximum(widths, _SHORTEST_M) / 2.0, cap_style="flat", join_style="mitre")
     polygons = [band if isinstance(band, Polygon) else areas_of(band, largest=True) for band in around]
     if any(polygon is None or polygon.is_empty for polygon in polygons):
         raise ValueError("a shape whose band has no area")

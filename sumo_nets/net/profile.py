@@ -22,7 +22,7 @@ _BESIDE_M = 5.0
 _ROUNDS = 300
 _NEAR_M = 1e-6
 
-Ints = NDArray[np.intp]
+_Ints = NDArray[np.intp]
 On = Literal["street", "path", "steps", "raised"]
 
 
@@ -74,8 +74,8 @@ class Profile:
     xy: Floats
     z: Floats
     street: NDArray[np.bool_]
-    tail: Ints
-    head: Ints
+    tail: _Ints
+    head: _Ints
     run_m: Floats
 
     @classmethod
@@ -118,7 +118,7 @@ class Profile:
         return clamped(self.z, self.tail, self.head, WALK_GRADE_MAX * self.run_m)
 
 
-def clamped(z_m: Floats, tail: Ints, head: Ints, most_m: Floats) -> Floats:
+def clamped(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
     """Heights near (N,) `z_m` of which those of `tail` and `head`, (E,) numbers, differ by (E,) `most_m` at most.
 
     First every joint that is too steep pulls its ends together, many times, which takes narrow faults away where they
@@ -135,7 +135,7 @@ def clamped(z_m: Floats, tail: Ints, head: Ints, most_m: Floats) -> Floats:
     return 0.5 * (_lowered(z, tail, head, most_m) - _lowered(-z, tail, head, most_m))
 
 
-def _lowered(z_m: Floats, tail: Ints, head: Ints, most_m: Floats) -> Floats:
+def _lowered(z_m: Floats, tail: _Ints, head: _Ints, most_m: Floats) -> Floats:
     """The highest heights not above `z_m` that keep the bounds."""
     z = z_m.copy()
     while True:
@@ -152,13 +152,13 @@ def _dense(c: Course) -> Floats:
     known = np.isfinite(c.points[:, 2])
     if not known.any():
         return np.zeros((0, 3))
-    at = along(c.points)
+    at = metres_along(c.points)
     count = max(int(np.ceil(at[-1] / _SPACING_M)), 1)
     s = np.unique(np.concatenate([np.linspace(0.0, at[-1], count + 1)])) if at[-1] > 0.0 else np.zeros(1)
     columns = [np.interp(s, at, c.points[:, k]) for k in (0, 1)]
     return np.column_stack([*columns, np.interp(s, at[known], c.points[known, 2])])
 
 
-def along(points: Floats) -> Floats:
+def metres_along(points: Floats) -> Floats:
     """(N,) metres from the first of (N, 2) points or more columns, level."""
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points[:, :2], axis=0).T))])

@@ -18,7 +18,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from cosim.core.geometry import Floats
 from cosim.place import overlay
 
-REACH_M = 2.5
+_REACH_M = 2.5
 """How far beyond its end a strip may look for its corner."""
 
 WELD_M = 0.005
@@ -60,7 +60,7 @@ def joined(polygons: Polygons, ends: Floats, inner: Floats, widths_m: Floats, co
     forth /= np.maximum(np.hypot(forth[:, 0], forth[:, 1]), 1e-9)[:, None]
     aside = np.column_stack([-forth[:, 1], forth[:, 0]]) * (widths_m / 2)[:, None]
     left, right = ends + aside, ends - aside
-    beyond = shapely.polygons(np.stack([right, left, left + REACH_M * forth, right + REACH_M * forth], axis=1))
+    beyond = shapely.polygons(np.stack([right, left, left + _REACH_M * forth, right + _REACH_M * forth], axis=1))
     edges = shapely.linestrings(np.stack([right, left], axis=1))
     met = overlay.intersection(beyond, corners)
     wanted = ~(shapely.is_missing(met) | shapely.is_empty(met))

@@ -30,7 +30,7 @@ from cosim.place.street_map import StreetMap
 from sumo_nets.city.store import cache_folder
 from sumo_nets.net.netfile import read_net
 
-FOLDER: Final = "read"
+SNAPSHOT_FOLDER: Final = "read"
 _SEAL_BYTES: Final = 32
 
 _Pools = tuple[list[NDArray[Any]], list[shapely.Geometry]]
@@ -56,16 +56,16 @@ def street_map_of(path: Path) -> StreetMap:
         net = path.read_bytes()
     except OSError:
         return read_net(path)
-    kept = cache_folder() / FOLDER / f"{_key(path.name, net)}.map"
+    kept = cache_folder() / SNAPSHOT_FOLDER / f"{_key(path.name, net)}.map"
     with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
         return thawed(kept.read_bytes())
     street_map = read_net(path)
     with suppress(OSError):
-        _write(kept, frozen(street_map))
+        _write(kept, map_as_bytes(street_map))
     return street_map
 
 
-def frozen(street_map: StreetMap) -> bytes:
+def map_as_bytes(street_map: StreetMap) -> bytes:
     """A StreetMap as bytes: equal maps give equal bytes."""
     arrays: list[NDArray[Any]] = []
     geometries: list[shapely.Geometry] = []
@@ -90,7 +90,7 @@ def frozen(street_map: StreetMap) -> bytes:
 
 
 def thawed(data: bytes) -> StreetMap:
-    """The StreetMap in bytes of `frozen`. Raises ValueError when they are not whole."""
+    """The StreetMap in bytes of `map_as_bytes`. Raises ValueError when they are not whole."""
     if hashlib.sha256(memoryview(data)[_SEAL_BYTES:]).digest() != data[:_SEAL_BYTES]:
         raise ValueError("a damaged snapshot")
     with _without_gc():

@@ -102,12 +102,12 @@ class Blind:
 
 def frontal(scenario_id: str) -> Scenario:
     """A reactive scenario of a few seconds: a small city, few people, somebody who walks at the robot."""
-    from scenarios.builders.reactive import build
+    from scenarios.builders.reactive import build_reactive
     from scenarios.execution.places import place
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build("frontal", city, street_map, WalkGraph(street_map), 1, scenario_id)
+    whole = build_reactive("frontal", city, street_map, WalkGraph(street_map), 1, scenario_id)
     return msgspec.structs.replace(whole, crowd=CrowdSpec(persons=4, radius_m=40.0, vehicles=0))
 
 

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import msgspec
 import pytest
 
-from bridge.live import LARGEST_B, taken
+from bridge.live import LARGEST_B, answer_to
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection
@@ -121,7 +121,7 @@ def test_the_log_alone_replays_the_guests() -> None:
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
     """Nothing of it reaches the simulation."""
     one = guests()
-    ack = taken(message, one.offer)
+    ack = answer_to(message, one.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
     assert not one.react(query(0)).actors and one.log == ()
 
@@ -275,12 +275,12 @@ def once(what: Callable[[], bool]) -> None:
 @contextmanager
 def on_air(folder: Path) -> Iterator[OnAir]:
     """`cosim run --live` of an episode that lasts until it is told to end."""
-    from scenarios.builders.long_horizon import build
+    from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
 
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
+    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     crowd = CrowdSpec(persons=6, radius_m=50.0, vehicles=2)
     short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=())
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from scenarios.bench import cameras as bench_cameras
-from scenarios.bench.cameras import Figure, measure, whole_frame
+from scenarios.bench.cameras import Figure, time_cameras, whole_frame
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
@@ -28,7 +28,7 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
         Figure("by gl again", partial(whole_frame, "gl", 3, 2), 200.0),
         Figure("by bullet", partial(whole_frame, "bullet", 3, 2), 200.0),
     )
-    found = measure(2, lambda _: None, figures)
+    found = time_cameras(2, lambda _: None, figures)
     assert [len(found[figure.name].fps) for figure in figures] == [0, 0, 0, 0, 2]
     assert "apt-get install libegl1" in found["by gl"].why and "OpenGL 4.3" in found["by gl"].why
     assert found["by a package"].why == "ModuleNotFoundError: No module named 'nowhere'"
@@ -36,7 +36,7 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
     assert found["by bullet"].why == ""
     monkeypatch.setattr(bench_cameras, "FIGURES", figures)
     monkeypatch.setattr(bench_cameras, "RATIOS", (("gl / bullet", "by gl", "by bullet", ">= 5"),))
-    monkeypatch.setattr(bench_cameras, "measure", lambda *_: found)
+    monkeypatch.setattr(bench_cameras, "time_cameras", lambda *_: found)
     said = cosim("bench", "camera", "--rounds", "2")
     assert said.returncode == 0, said.stderr
     told = " ".join(said.stdout.split())

@@ -76,7 +76,7 @@ class Unfinished: pass
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder: a suite of three short scenarios, one of four, and a module with policies."""
-    from scenarios.builders.long_horizon import build
+    from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
 
     folder = tmp_path_factory.mktemp("desk")
@@ -85,7 +85,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     graph = WalkGraph(street_map)
     scenarios = []
     for i in range(4):
-        whole = build(city, street_map, graph, i, f"t-{i}")
+        whole = build_long_horizon(city, street_map, graph, i, f"t-{i}")
         fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
         crowd = CrowdSpec(persons=8, radius_m=50.0, vehicles=2)
         scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 2.0}))

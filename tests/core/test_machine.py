@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from cosim.machine import EXIT_CODE, FOR_PICTURES, LIBRARIES, Machine, main, missing, refusal
+from cosim.machine import EXIT_CODE, FOR_PICTURES, LIBRARIES, Machine, check_machine, missing, refusal
 from tests.conftest import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -59,7 +59,7 @@ def test_each_missing_library_is_named_with_its_package() -> None:
 def test_whoever_is_not_root_is_told_and_stopped(capsys: pytest.CaptureFixture[str]) -> None:
     """Without the right to install, the check says what is missing and ends with 3; nothing is installed."""
     machine = Fake("libx11-6", "python3.11")
-    assert main(["--install", "--python", "python3.11"], machine) == EXIT_CODE and machine.installed == []
+    assert check_machine(["--install", "--python", "python3.11"], machine) == EXIT_CODE and machine.installed == []
     said = capsys.readouterr().err
     assert "lacks Python 3.11 with venv (there is no 'python3.11') and libX11.so.6 (package libx11-6)." in said
     assert "python3.11 python3.11-venv libx11-6\n" in said and "make PYTHON=" in said
@@ -69,23 +69,23 @@ def test_root_installs_exactly_what_is_missing(capsys: pytest.CaptureFixture[str
     """As root on Debian, what is missing and nothing else is installed, and said; asked again, nothing happens."""
     archive = ("libx11-6", "libegl1", "python3.11", "python3.11-venv")
     machine = Fake("libx11-6", "libegl1", "python3.11", root=True, archive=archive)
-    assert main(["--install"], machine) == 0
+    assert check_machine(["--install"], machine) == 0
     assert machine.installed == ["python3.11", "python3.11-venv", "libx11-6", "libegl1"]
     assert "lacks libx11-6, libegl1: apt-get installs exactly that" in capsys.readouterr().err
-    assert main(["--install"], machine) == 0 and len(machine.installed) == 4
+    assert check_machine(["--install"], machine) == 0 and len(machine.installed) == 4
     assert capsys.readouterr().err == ""
 
 
 def test_what_the_archive_does_not_have_stops_root_too(capsys: pytest.CaptureFixture[str]) -> None:
     """Where apt-get has no Python 3.11, the libraries are installed all the same, and what is left is said."""
     machine = Fake("libx11-6", "python3.11", root=True, archive=("libx11-6",))
-    assert main(["--install"], machine) == EXIT_CODE and missing(machine) == []
+    assert check_machine(["--install"], machine) == EXIT_CODE and missing(machine) == []
     assert "error: this machine lacks Python 3.11" in capsys.readouterr().err
 
 
 def test_without_egl_a_run_goes_on(capsys: pytest.CaptureFixture[str]) -> None:
     """Only pictures need EGL: its absence is one line, and no error."""
-    assert main([], Fake("libegl1")) == 0
+    assert check_machine([], Fake("libegl1")) == 0
     said = capsys.readouterr().err
     assert said.startswith("note: no libEGL.so.1") and said.count("\n") == 1
     assert refusal(Fake("libegl1")) == ""

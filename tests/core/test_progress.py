@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from cosim.cli.progress import doing, in_words
+from cosim.cli.progress import doing, stage_in_words
 from cosim.core.telling import duration
 
 
@@ -33,10 +33,13 @@ def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
 
 def test_what_is_left_is_said_when_it_is_known() -> None:
     """A tenth took ten seconds: a minute and a half is left; of the first moments nothing is concluded."""
-    assert in_words("filming", 0.1, 10.0) == "filming: 10 %, about 90 s left"
-    assert in_words("filming", 0.5, 10.0) == "filming: 50 %, about 10 s left"
-    assert in_words("filming", 0.01, 10.0) == "filming: 1 %" and in_words("filming", 0.5, 1.0) == "filming: 50 %"
-    assert in_words("filming", None, 10.0) == "filming"
+    assert stage_in_words("filming", 0.1, 10.0) == "filming: 10 %, about 90 s left"
+    assert stage_in_words("filming", 0.5, 10.0) == "filming: 50 %, about 10 s left"
+    assert (
+        stage_in_words("filming", 0.01, 10.0) == "filming: 1 %"
+        and stage_in_words("filming", 0.5, 1.0) == "filming: 50 %"
+    )
+    assert stage_in_words("filming", None, 10.0) == "filming"
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from shapely.geometry import box
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
-from cosim.episode.driver import Doing, Driver
+from cosim.episode.driver import Driver, PolicyCall
 from cosim.episode.ports import Manifest, Observation, Privileged
 
 MINE = Manifest("mine", camera=None)
@@ -207,7 +207,7 @@ def test_a_policy_at_work_is_timed() -> None:
     told: list[tuple[str, int] | None] = []
 
     class Notes:
-        def starts(self, doing: Doing, tick: int) -> None:
+        def starts(self, doing: PolicyCall, tick: int) -> None:
             told.append((doing, tick))
 
         def stops(self) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from cosim.episode.log import Log
-from cosim.judge.metrics import METRICS, Episode, measure, progress_of
+from cosim.judge.metrics import METRICS, EpisodeFacts, every_metric, progress_of
 from cosim.judge.referee import Failure
 
 
@@ -35,13 +35,13 @@ def failure(kind: str, other_kind: str = "") -> Failure:
     return Failure(kind, 0, 0.0, 0.0, 0.0, 1.0, "x", other_kind)  # type: ignore[arg-type]
 
 
-def episode(one: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0) -> Episode:
-    return Episode(one, failures, 0, ended, length_m)  # type: ignore[arg-type]
+def episode(one: Log, *failures: Failure, ended: str = "timeout", length_m: float = 100.0) -> EpisodeFacts:
+    return EpisodeFacts(one, failures, 0, ended, length_m)  # type: ignore[arg-type]
 
 
 def test_a_clean_drive_to_the_goal() -> None:
     """100 m at 1 m/s in 2,000 ticks, nobody near: the textbook values."""
-    measures = measure(episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal"))
+    measures = every_metric(episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal"))
     expected = {
         "success": 1.0, "goal_reached": 1.0, "route_completion": 1.0, "spl": 1.0, "failures_per_100m": 0.0,
         "velocity_mean_mps": 1.0, "path_length_m": 100.0, "progress_m": 100.0, "time_s": 100.0,
@@ -57,7 +57,7 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
     there = [0.1 * (i + 1) for i in range(400)]
     back = [40.0 - 0.1 * (i + 1) for i in range(200)]
     failures = (failure("collision", "pedestrian"), failure("collision", "vehicle"), failure("freezing"))
-    measures = measure(episode(log(there + back), *failures))
+    measures = every_metric(episode(log(there + back), *failures))
     assert measures["path_length_m"] == pytest.approx(60.0)
     assert measures["progress_m"] == pytest.approx(40.0)
     assert measures["failures_per_100m"] == pytest.approx(5.0)
@@ -72,7 +72,7 @@ def test_rates_are_per_100_m_travelled_and_of_progress() -> None:
 def test_the_total_is_the_sum_of_its_parts() -> None:
     """FC = C + OL + F, as in the paper's table."""
     failures = [failure(k) for k in ("collision", "out_of_lane", "out_of_lane", "freezing")]
-    m = measure(episode(log([0.05 * i for i in range(1, 500)]), *failures))
+    m = every_metric(episode(log([0.05 * i for i in range(1, 500)]), *failures))
     parts = (m[f"{name}_per_100m"] for name in ("collisions", "out_of_lane", "freezings"))
     assert m["failures_per_100m"] == pytest.approx(sum(p for p in parts if p is not None))
 
@@ -82,18 +82,18 @@ def test_a_reset_is_neither_travel_nor_progress() -> None:
     assert progress_of(np.array([4.0, 6.0, 12.0]), np.array([np.nan, 10.0, np.nan])) == pytest.approx(8.0)
     assert progress_of(np.array([8.0, 6.0, 9.0]), np.array([5.0, np.nan, np.nan])) == pytest.approx(9.0)
     drive = log([1.0, 2.0, 3.0, 11.0, 12.0], resets={2: 10.0})
-    assert measure(episode(drive))["path_length_m"] == pytest.approx(5.0)
+    assert every_metric(episode(drive))["path_length_m"] == pytest.approx(5.0)
 
 
 def test_a_goal_reached_with_failures_is_no_success() -> None:
     """`goal_reached` counts the arrival, `success` only a clean one."""
-    measures = measure(episode(log([50.0, 100.0]), failure("out_of_lane"), ended="goal"))
+    measures = every_metric(episode(log([50.0, 100.0]), failure("out_of_lane"), ended="goal"))
     assert (measures["goal_reached"], measures["success"]) == (1.0, 0.0)
 
 
 def test_a_rate_without_distance_is_absent_not_zero() -> None:
     """A robot that never moved has failures but no failures per 100 m, and no time to goal."""
-    measures = measure(episode(log([0.0] * 400), failure("freezing")))
+    measures = every_metric(episode(log([0.0] * 400), failure("freezing")))
     assert measures["freezings"] == 1.0
     assert measures["failures_per_100m"] is None
     assert measures["time_to_goal_s"] is None
@@ -103,7 +103,7 @@ def test_a_rate_without_distance_is_absent_not_zero() -> None:
 
 def test_space_metrics_have_the_signs_of_their_names() -> None:
     """At 1 m from a person the intimate space is kept and the personal space violated, at 0.4 m both are lost."""
-    at_1m, at_40cm = (measure(episode(log([0.05] * 10, person_m=d))) for d in (1.0, 0.4))
+    at_1m, at_40cm = (every_metric(episode(log([0.05] * 10, person_m=d))) for d in (1.0, 0.4))
     assert (at_1m["space_compliance"], at_1m["personal_space_violation"]) == (1.0, 1.0)
     assert (at_40cm["space_compliance"], at_40cm["personal_space_violation"]) == (0.0, 1.0)
     assert at_40cm["pedestrian_distance_min_m"] == 0.4
@@ -114,7 +114,7 @@ def test_time_on_the_carriageway_and_braking_vehicles_are_summed() -> None:
     one = log([0.05 * (i + 1) for i in range(100)])
     one.on_carriageway[20:50] = True
     one.vehicles_braked[25], one.vehicles_braked[40] = 2, 1
-    measures = measure(episode(one))
+    measures = every_metric(episode(one))
     assert measures["carriageway_time_s"] == pytest.approx(1.5)
     assert measures["vehicles_braked"] == 3.0
 
@@ -123,13 +123,13 @@ def test_spl_charges_detours() -> None:
     """A clean drive of 125 m for a route of 100 m has an SPL of 0.8."""
     there = [0.5 * (i + 1) for i in range(225)]
     back = [112.5 - 0.5 * (i + 1) for i in range(25)]
-    assert measure(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
+    assert every_metric(episode(log(there + back), ended="goal"))["spl"] == pytest.approx(0.8)
 
 
 def test_every_metric_is_defined_for_every_episode() -> None:
     """No metric raises or gives NaN, whatever the episode."""
     for one in (episode(log([0.05])), episode(log([0.0, 120.0]), ended="goal"), episode(log([1.0] * 3, person_m=0.1))):
-        values = measure(one)
+        values = every_metric(one)
         assert set(values) == set(METRICS)
         assert all(value is None or np.isfinite(value) for value in values.values())
 
@@ -137,6 +137,6 @@ def test_every_metric_is_defined_for_every_episode() -> None:
 def test_resets_neither_hide_nor_invent_a_failure_to_progress() -> None:
     """A jump forward does not make a standing robot progress, and a jump back does not make a driving one stall."""
     stands = log([0.0] * 200 + [10.0] * 200, resets={199: 10.0})
-    assert measure(episode(stands))["failure_to_progress"] == 4.0
+    assert every_metric(episode(stands))["failure_to_progress"] == 4.0
     drives = [0.05 * (i + 1) for i in range(150)] + [0.05 * (i + 1) for i in range(150)]
-    assert measure(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0
+    assert every_metric(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0

@@ -11,7 +11,18 @@ from shapely.geometry import box
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose
-from cosim.core.state import NO_VEHICLES, STILL, Contact, Motion, People, RobotState, Signal, Street, Vehicles, frozen
+from cosim.core.state import (
+    NO_VEHICLES,
+    STILL,
+    Contact,
+    Motion,
+    People,
+    RobotState,
+    Signal,
+    Street,
+    Vehicles,
+    write_protected,
+)
 from cosim.episode.step import Step
 from cosim.judge.referee import Referee, Verdict
 from cosim.place.street_map import WalkableArea
@@ -56,7 +67,7 @@ def step(
     """The robot ends the tick at (x, y), which is also its place on the route."""
     robot = RobotState(Pose(x_m, y_m, 0.0), speed)
     street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
-    motion = Motion(robot, frozen([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
+    motion = Motion(robot, write_protected([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
     return Step(tick, robot, street, x_m, None, STILL, events, motion, street, x_m)
 
 

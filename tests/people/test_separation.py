@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sumo_nets.crowd.separation import KEEP_M, kept_apart
+from sumo_nets.crowd.separation import SHOULDERS_M, kept_apart
 
 REACH_M = 2.2 * 0.05
 
@@ -27,7 +27,7 @@ def test_two_who_walk_at_each_other_pass_without_touching(aside_m: float, firm: 
     """Head-on or nearly so, both arrive, never nearer than shoulders, and never faster than the reach of a step."""
     start, goal = np.array([[-4.0, 0.0], [4.0, aside_m]]), np.array([[4.0, 0.0], [-4.0, aside_m]])
     track = walked(start, goal, np.array([firm, False]))
-    assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * KEEP_M
+    assert min(float(np.hypot(*(at[0] - at[1]))) for at in track) > 0.9 * SHOULDERS_M
     assert np.hypot(*(track[-1] - goal).T).max() < 0.05
     steps = np.diff(np.array([start, *track]), axis=0)
     assert np.hypot(steps[..., 0], steps[..., 1]).max() <= REACH_M + 1e-9
@@ -38,7 +38,7 @@ def test_who_is_firm_does_not_give_way() -> None:
     start, goal = np.array([[-4.0, 0.0], [4.0, 0.0]]), np.array([[4.0, 0.0], [-4.0, 0.0]])
     track = walked(start, goal, np.array([True, False]))
     assert all(at[0, 1] == 0.0 for at in track)
-    assert max(abs(float(at[1, 1])) for at in track) > 0.8 * KEEP_M
+    assert max(abs(float(at[1, 1])) for at in track) > 0.8 * SHOULDERS_M
 
 
 def test_a_throng_at_one_place_parts() -> None:
@@ -68,7 +68,7 @@ def test_who_wants_to_stand_inside_a_group_stands_still_before_it() -> None:
         to = kept_apart(at, goal, firm, REACH_M, stand)
         steps.append(float(np.hypot(*(to[3] - at[3]))))
         at = to
-    assert np.hypot(*(at[:3] - at[3]).T).min() > 0.9 * KEEP_M
+    assert np.hypot(*(at[:3] - at[3]).T).min() > 0.9 * SHOULDERS_M
     assert max(steps[40:]) == 0.0
 
 
@@ -78,6 +78,6 @@ def test_who_stands_gives_way_to_who_comes_through() -> None:
     for _ in range(100):
         wanted = np.array([at[0] + (0.07, 0.0), [0.0, 0.0]])
         at = kept_apart(at, wanted, np.array([False, False]), REACH_M, np.array([False, True]))
-        assert np.hypot(*(at[1] - at[0])) > 0.9 * KEEP_M
+        assert np.hypot(*(at[1] - at[0])) > 0.9 * SHOULDERS_M
     assert at[0, 0] > 2.0
     assert np.hypot(*at[1]) < 0.05

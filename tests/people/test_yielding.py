@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose, box_disk_gap
-from cosim.people.yielding import KEEP_M, Body, stepped_round
+from cosim.people.yielding import STEP_ROUND_GAP_M, RobotBody, stepped_round
 
 HALF = (0.36, 0.29)
 STEP_M = 1.4 * 0.05
@@ -28,7 +28,7 @@ def test_someone_who_walks_at_a_standing_robot_passes_it_without_touching(aside_
     for _ in range(250):
         away = goal - xy
         far = max(float(np.hypot(*away[0])), 1e-9)
-        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), Body(robot, HALF))
+        xy = stepped_round(xy, xy + away / far * min(STEP_M, far), RobotBody(robot, HALF))
         nearest = min(nearest, gap(xy, robot))
     assert nearest > 0.0
     assert float(np.hypot(*(goal - xy)[0])) < 0.2
@@ -38,15 +38,15 @@ def test_a_robot_that_drives_at_somebody_hits_them() -> None:
     """Only a person's own steps are changed: who stands still is not moved out of the robot's way."""
     person = np.array([[1.0, 0.0]])
     for x_m in np.arange(0.0, 0.8, 0.1):
-        assert np.array_equal(stepped_round(person, person, Body(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person)
+        assert np.array_equal(stepped_round(person, person, RobotBody(Pose(x_m, 0.0, 0.0), HALF, 2.0)), person)
     assert gap(person, Pose(0.7, 0.0, 0.0)) < 0.0
 
 
 def test_people_who_are_not_near_walk_as_they_want() -> None:
     """Far from the robot, beside it, and walking away from it nothing changes."""
-    before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + KEEP_M + 0.05], [0.7, 0.0]])
+    before = np.array([[5.0, 0.0], [0.0, 0.29 + 0.3 + STEP_ROUND_GAP_M + 0.05], [0.7, 0.0]])
     wanted = before + np.array([[-0.07, 0.0], [0.07, 0.0], [0.07, 0.0]])
-    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF)), wanted)
+    assert np.allclose(stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF)), wanted)
 
 
 def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
@@ -55,7 +55,7 @@ def test_who_walks_against_a_moving_robot_steps_aside_in_time() -> None:
     nearest = math.inf
     for tick in range(80):
         robot = Pose(1.5 * 0.05 * tick, 0.0, 0.0)
-        xy = stepped_round(xy, xy - np.array([[STEP_M, 0.0]]), Body(robot, HALF, 1.5))
+        xy = stepped_round(xy, xy - np.array([[STEP_M, 0.0]]), RobotBody(robot, HALF, 1.5))
         nearest = min(nearest, gap(xy, Pose(1.5 * 0.05 * (tick + 1), 0.0, 0.0)))
     assert nearest > 0.0
     assert float(xy[0, 0]) < 1.5 * 0.05 * 80 - 1.0
@@ -65,13 +65,13 @@ def test_who_walks_ahead_does_not_see_the_robot_come_from_behind() -> None:
     """A slower person in front keeps walking and is run into: the robot has to watch out."""
     before = np.array([[0.8, 0.0]])
     wanted = before + np.array([[0.03, 0.0]])
-    assert np.allclose(stepped_round(before, wanted, Body(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)
+    assert np.allclose(stepped_round(before, wanted, RobotBody(Pose(0.0, 0.0, 0.0), HALF, 2.0)), wanted)
 
 
 @pytest.mark.parametrize("x_m", [-0.3, 0.0, 0.5])
 def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> None:
     """Somebody who waits comes up to the robot, a hand's breadth away, and then stands still."""
-    body, place = Body(Pose(0.0, 0.0, 0.0), HALF), np.array([x_m, 0.45])
+    body, place = RobotBody(Pose(0.0, 0.0, 0.0), HALF), np.array([x_m, 0.45])
     xy, ways = np.array([[2.0, 1.2]]), []
     for _ in range(100):
         away = place - xy
@@ -80,4 +80,4 @@ def test_who_wants_to_stand_where_the_robot_is_stands_beside_it(x_m: float) -> N
         ways.append(float(np.hypot(*(after - xy)[0])))
         xy = after
     assert sum(ways[60:]) < 1e-4
-    assert KEEP_M - 1e-6 < gap(xy, body.pose) < KEEP_M + 0.11
+    assert STEP_ROUND_GAP_M - 1e-6 < gap(xy, body.pose) < STEP_ROUND_GAP_M + 0.11

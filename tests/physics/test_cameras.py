@@ -34,14 +34,14 @@ def without_opengl(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_auto_falls_to_bullet_without_opengl(without_opengl: None) -> None:
     """Where no context can be made, auto is bullet, whose renderer is named as ever."""
-    assert cameras.chosen("auto") == "bullet"
+    assert cameras.camera_of_choice("auto") == "bullet"
     assert cameras.renderer_of("bullet") == "bullet-tiny"
 
 
 def test_gl_without_opengl_names_the_packages(without_opengl: None) -> None:
     """Asking for gl there fails with the reason, the packages to install, and the way out."""
     with pytest.raises(EngineError, match=r"libEGL.so not loaded.*apt-get install libegl1 .*--camera bullet"):
-        cameras.chosen("gl")
+        cameras.camera_of_choice("gl")
 
 
 def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
@@ -59,7 +59,7 @@ def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
 
 def test_naming_cameras_starts_no_engine() -> None:
     """The command line can ask for the renderer without PyBullet's greeting."""
-    code = "import sys, physics.cameras.choice as c; c.chosen('auto'); print('pybullet' in sys.modules)"
+    code = "import sys, physics.cameras.choice as c; c.camera_of_choice('auto'); print('pybullet' in sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert said.stdout.strip() == "False"
 

@@ -22,8 +22,8 @@ from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
-from physics.street.furniture import CATALOGUE, KINDS, VARIANTS, Prop, footprints, parts_of, solids_of
-from physics.street.placement import CLEAR_HALF_M, END_M, Placement, clear_half_m, street_style
+from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, footprints, parts_of, solids_of
+from physics.street.placement import CLEAR_HALF_M, PROP_END_GAP_M, Placement, clear_half_m, street_style
 from physics.world.materials import MATERIALS, PAVINGS, Paving, friction, street_of
 from physics.world.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.world.world import BulletWorld
@@ -74,7 +74,7 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
     """Every size has few triangles, reaches the ground, fills its footprint below the heads and bumps within it."""
     entry = KINDS[kind.name]  # type: ignore[attr-defined]
     looks = range(len(entry.paints) if entry.grown else 1)
-    for variant, look in itertools.product(range(VARIANTS), looks):
+    for variant, look in itertools.product(range(PROP_VARIANTS), looks):
         length, depth, height = entry.size_m(variant)
         parts = parts_of(entry.name, variant, look)
         vertices = np.concatenate([part.mesh.vertices for part in parts])
@@ -92,7 +92,7 @@ def test_a_prop_is_small_cheap_and_stands_on_the_ground(kind: object) -> None:
 def test_crowns_are_closed_and_keep_to_their_room() -> None:
     """Of every tree: each edge of the crown has two sides, it hangs above the heads, within its spread, all lit."""
     kind = KINDS["tree"]
-    for variant, look in itertools.product(range(VARIANTS), range(len(kind.paints))):
+    for variant, look in itertools.product(range(PROP_VARIANTS), range(len(kind.paints))):
         crown = parts_of("tree", variant, look)[1]
         t = crown.mesh.triangles
         edges = np.concatenate([t[:, [0, 1]], t[:, [1, 2]], t[:, [2, 0]]])
@@ -140,7 +140,7 @@ def test_props_keep_off_what_is_not_theirs() -> None:
         ground = footprints(props)
         assert len(props) > 25
         assert shapely.distance(ground, street).min() > 0.0
-        assert shapely.distance(ground, zebra).min() >= END_M
+        assert shapely.distance(ground, zebra).min() >= PROP_END_GAP_M
         assert len(shapely.STRtree(ground).query(ground, predicate="intersects")[0]) == len(ground)
         houses = [b.polygon for key in keys_within(0.0, 0.0, 120.0) for b in frontage.in_tile(key)]
         assert not len(shapely.STRtree(houses).query(ground, predicate="intersects")[0])
@@ -148,7 +148,7 @@ def test_props_keep_off_what_is_not_theirs() -> None:
             strip = MAP.strips[prop.id.split(":")[1]]
             line = Polyline(strip.line)
             along = [line.project(x, y)[0] for x, y in shapely.get_coordinates(footprint)]
-            assert min(along) >= END_M - 1e-6 and max(along) <= line.length_m - END_M + 1e-6
+            assert min(along) >= PROP_END_GAP_M - 1e-6 and max(along) <= line.length_m - PROP_END_GAP_M + 1e-6
 
 
 def test_the_middle_of_a_sidewalk_is_free() -> None:

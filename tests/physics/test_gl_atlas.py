@@ -9,7 +9,7 @@ from cosim.core.errors import EngineError, UsageError
 from cosim.episode.ports import CameraSpec
 from physics.cameras.gl import context
 from physics.world.world import BulletWorld
-from scenarios.bench.cameras import busy_street, place_of
+from scenarios.bench.cameras import busy_street, camera_city
 
 pytestmark = [
     pytest.mark.engine,
@@ -25,7 +25,7 @@ def test_an_atlas_holds_the_pictures_of_its_cameras() -> None:
     from physics.cameras.gl.atlas import Atlas
     from physics.cameras.gl.camera import GlCamera
 
-    street_map = place_of(300.0)
+    street_map = camera_city(300.0)
     worlds = [BulletWorld(street_map, seed, (), "courier") for seed in (1, 2, 3)]
     busy = busy_street(street_map, 8, 5)
     ticks = [[busy.streets[i + k] for k in range(3)] for i in range(2)]
@@ -50,7 +50,7 @@ def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
     """People, fetched while the next are drawn: bit for bit what is drawn one by one, and they move."""
     from physics.cameras.gl.alone import PeopleAlone
 
-    busy = busy_street(place_of(300.0), 8, 3)
+    busy = busy_street(camera_city(300.0), 8, 3)
     with PeopleAlone((96, 54), 60.0) as eyes:
         single = [eyes.render(busy.robot.pose, street) for street in busy.streets]
         found = []
@@ -70,6 +70,6 @@ def test_an_atlas_too_large_is_refused_with_the_limit() -> None:
     """More rows than a texture may have."""
     from physics.cameras.gl.atlas import Atlas
 
-    world = BulletWorld(place_of(300.0), 1, (), "courier")
+    world = BulletWorld(camera_city(300.0), 1, (), "courier")
     with pytest.raises(UsageError, match="1 to 16 fit"):
         Atlas([world] * 17, CameraSpec(64, 1024))

@@ -14,7 +14,7 @@ from cosim.core.state import LABELS, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
-from physics.cameras.gl.crowd import LEVEL_PX, Crowd
+from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.cameras.gl.targets import Target
@@ -23,7 +23,7 @@ from physics.cameras.view import Shot, shot
 from physics.people.body import body
 from physics.people.clips import own_clips
 from physics.people.figure import LEVELS
-from physics.people.looks import ALL, look
+from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
 from physics.people.skeleton import skinned
 
@@ -45,7 +45,7 @@ def street(seed: int, count: int = 50) -> People:
 
 
 @contextmanager
-def drawing(crowd: Crowd, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
+def drawing(crowd: CrowdDrawing, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
     gl, anchor = context(), anchor_of(taken.eye_m)
     all_ = np.ones(len(people), dtype=bool)
     crowd.set(people, 2.0, np.zeros(len(people)), taken, anchor, all_, all_)
@@ -61,20 +61,20 @@ def drawing(crowd: Crowd, people: People, taken: Shot) -> Iterator[tuple[NDArray
     block.release()
 
 
-def mask(crowd: Crowd, people: People, taken: Shot) -> NDArray[np.bool_]:
+def mask(crowd: CrowdDrawing, people: People, taken: Shot) -> NDArray[np.bool_]:
     with drawing(crowd, people, taken) as (_, labels):
         return np.asarray(labels == LABELS["person"])
 
 
 @pytest.fixture
-def crowd() -> Iterator[Crowd]:
+def crowd() -> Iterator[CrowdDrawing]:
     with context() as gl:
-        crowd = Crowd(gl, False)
+        crowd = CrowdDrawing(gl, False)
         yield crowd
         crowd.release()
 
 
-def test_levels_of_detail_keep_the_silhouettes(crowd: Crowd, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch) -> None:
     """In pictures of busy streets levels of detail change less than 2 % of the silhouettes' pixels."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     scenes = [street(seed) for seed in range(4)]
@@ -89,7 +89,7 @@ def test_levels_of_detail_keep_the_silhouettes(crowd: Crowd, monkeypatch: pytest
 
 @pytest.mark.parametrize("level", range(1, LEVELS))
 def test_each_level_is_like_full_detail_where_it_begins(
-    crowd: Crowd, monkeypatch: pytest.MonkeyPatch, level: int
+    crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, level: int
 ) -> None:
     """At the size at which a level begins it changes less than 2 % of silhouette pixels, the coarsest less than 3 %."""
     far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
@@ -106,13 +106,13 @@ def test_each_level_is_like_full_detail_where_it_begins(
     assert changed < (0.03 if level == LEVELS - 1 else 0.02) * total
 
 
-def test_the_card_skins_as_the_reference_does(crowd: Crowd) -> None:
+def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     """The outline of a walker near by is that of the mesh skinned by numpy: head, hands and feet where they belong."""
     people = People.of(("c3",), [[5.0, 0.0]], [0.8], [1.4], ("walk",), [0.3])
     taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
     rows, columns = np.nonzero(mask(crowd, people, taken))
     pose = poses(people, 2.0)
-    who = look("c3")
+    who = look_of("c3")
     made = body(ALL[who.outfit], 1)
     grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
     at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]
@@ -128,14 +128,14 @@ def test_a_body_of_the_users_is_worn_by_everybody() -> None:
     """With a body given, people near and far are drawn with it, in our poses."""
     with context() as gl:
         made = body(ALL[0], 1)
-        everybody = Crowd(gl, False, made, own_clips())
+        everybody = CrowdDrawing(gl, False, made, own_clips())
         taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
         assert mask(everybody, street(0), taken).sum() > 500
         everybody.draw("moving")
         everybody.release()
 
 
-def test_nobody_is_drawn_as_nothing(crowd: Crowd) -> None:
+def test_nobody_is_drawn_as_nothing(crowd: CrowdDrawing) -> None:
     """Without people the picture stays empty, and drawing does no harm."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     assert not mask(crowd, street(0, 0), taken).any()

@@ -14,15 +14,15 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from cosim.core.state import PERSON_RADIUS_M, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
-from physics.people.body import COATS, Body, body, far_body
+from physics.people.body import COATS, SkinnedBody, body, far_body
 from physics.people.captures import capture, read_capture
 from physics.people.clips import own_clips
 from physics.people.families import FAMILIES, skeleton
 from physics.people.figure import LEVELS, MESH_LEVELS
-from physics.people.gaits import FRAMES, gait
+from physics.people.gaits import CYCLE_FRAMES, gait
 from physics.people.gestures import SEAT_M, SEATED_BACK_M
-from physics.people.looks import ALL, family_of, look
-from physics.people.parts import PARTS, part_colours, part_meshes, placed
+from physics.people.looks import ALL, family_of, look_of
+from physics.people.parts import RIGID_PARTS, part_colours, part_meshes, placed_parts
 from physics.people.poses import poses
 from physics.people.skeleton import INDEX, JOINTS, MIRRORED, PARENTS, axis_angle, forward, rodrigues, skinned
 
@@ -35,7 +35,7 @@ def crowd(n: int, doing: str = "walk", pace: float = 1.4, strides: Floats | None
     return People.of(names, np.zeros((n, 2)), np.zeros(n), np.full(n, pace), (doing,) * n, strides)  # type: ignore[arg-type]
 
 
-def posed(made: Body, row: int) -> Floats:
+def posed(made: SkinnedBody, row: int) -> Floats:
     return skinned(made.vertices, made.joints, made.weights, own_clips().matrices[row])
 
 
@@ -113,7 +113,9 @@ def test_soles_touch_the_ground_in_stance() -> None:
     for k, family in enumerate(FAMILIES):
         made = body(next(outfit for outfit in ALL if outfit.family == family), 1)
         walks = [
-            first + np.arange(0, FRAMES, 4) for first, pace in zip(clips.gaits[k], PACES_MPS, strict=True) if pace < 2
+            first + np.arange(0, CYCLE_FRAMES, 4)
+            for first, pace in zip(clips.gaits[k], PACES_MPS, strict=True)
+            if pace < 2
         ]
         rows = np.concatenate([*walks, *(first[k : k + 1] + 8 for first in clips.gestures.values())])
         for row in rows.tolist():
@@ -195,13 +197,14 @@ def test_looks_hang_on_the_name_alone() -> None:
     """The same name looks the same in another process, another seed dresses it anew at the same stature."""
     names = [f"c{i}" for i in range(60)]
     code = (
-        f"from physics.people.looks import look\nfor n in {names!r}: w = look(n); print(w.outfit, w.colours.tolist())"
+        f"from physics.people.looks import look_of\n"
+        f"for n in {names!r}: w = look_of(n); print(w.outfit, w.colours.tolist())"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert said.stdout.splitlines() == [f"{look(n).outfit} {look(n).colours.tolist()}" for n in names]
-    assert len({look(n).outfit for n in names}) > 12
-    assert len({look(n).colours.tobytes() for n in names}) == 60
-    assert sum(look(n, 7).colours.tobytes() != look(n).colours.tobytes() for n in names) == 60
+    assert said.stdout.splitlines() == [f"{look_of(n).outfit} {look_of(n).colours.tolist()}" for n in names]
+    assert len({look_of(n).outfit for n in names}) > 12
+    assert len({look_of(n).colours.tobytes() for n in names}) == 60
+    assert sum(look_of(n, 7).colours.tobytes() != look_of(n).colours.tobytes() for n in names) == 60
 
 
 def test_statures_are_of_all_ages() -> None:
@@ -260,11 +263,11 @@ def test_poses_are_few_numbers_that_sum_to_one() -> None:
 def test_rigid_parts_follow_the_joints() -> None:
     """Thirteen parts per person; the hand of the stopping arm is where the skinned one is."""
     people = People.of(("e1",), [[3.0, 4.0]], [0.0], [0.0], ("stop",))
-    parts = placed(people, np.array([0.5]), 0.0)
-    assert parts.at_m.shape == (1, len(PARTS), 3) and len(part_colours("e1")) == len(PARTS) == 13
+    parts = placed_parts(people, np.array([0.5]), 0.0)
+    assert parts.at_m.shape == (1, len(RIGID_PARTS), 3) and len(part_colours("e1")) == len(RIGID_PARTS) == 13
     assert np.linalg.norm(parts.turn, axis=-1) == pytest.approx(1.0)
     family = family_of("e1")
-    wrist = [joint for joint, _ in PARTS].index("right_wrist")
+    wrist = [joint for joint, _ in RIGID_PARTS].index("right_wrist")
     x, y, z, w = parts.turn[0, wrist]
     mesh = part_meshes(family)[wrist].vertices
     turned = mesh + 2.0 * np.cross((x, y, z), np.cross((x, y, z), mesh) + w * mesh) + parts.at_m[0, wrist]

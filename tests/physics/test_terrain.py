@@ -19,7 +19,7 @@ from physics.world.ground import Ground
 from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
 from sumo_nets.net.elevation import steep_ports, steep_strips, surveyed
 from sumo_nets.net.profile import Course, Meeting, On, clamped, course, what_lies_there
-from sumo_nets.net.snapshot import frozen, thawed
+from sumo_nets.net.snapshot import map_as_bytes, thawed
 from tests.tiny_street import KEYS, no_cracks, plan_areas, tiny_map, triangles
 
 HAND = Terrain(10.0, 20.0, 2.0, np.array([[0, 1, 2], [0, 1, 6]], dtype=np.float32))
@@ -268,12 +268,12 @@ def test_nothing_floats_on_a_hill() -> None:
 def test_a_snapshot_keeps_the_land() -> None:
     """Terrain and elevation come back from a snapshot to the bit; a flat map comes back flat."""
     told = Elevation(1.5, 9.0, 20, 3, 0.01, 4, 0.5, ("a", "b"), (("c", 1),))
-    again = thawed(frozen(dataclasses.replace(HILLY, elevation=told)))
+    again = thawed(map_as_bytes(dataclasses.replace(HILLY, elevation=told)))
     assert again.terrain is not None and HILLY.terrain is not None and again.elevation == told
     assert np.array_equal(again.terrain.heights, HILLY.terrain.heights)
     assert again.terrain.heights.dtype == np.float32 and again.terrain.step_m == 2.0
     assert again.steep == {"a", "b"} and Port("c", 1) in again.too_steep and len(again.too_steep) == 5
-    flat = thawed(frozen(tiny_map()))
+    flat = thawed(map_as_bytes(tiny_map()))
     assert flat.terrain is None and flat.elevation is None
 
 

@@ -11,9 +11,9 @@ import pytest
 
 from cosim.core.errors import SpecError, UsageError
 from physics.textures.bonds import basket, courses, herringbone
-from physics.textures.facades import DOORS, STREETS, VARIANTS, WALL_STYLES, facade_layers
-from physics.textures.ground import GROUND, SURFACE_LAYERS, ground_layers, layer_of
-from physics.textures.layers import Layers, encoded, joined, linear
+from physics.textures.facades import BAY_VARIANTS, DOORS, STREETS, WALL_STYLES, facade_layers
+from physics.textures.ground import GROUND_RECIPES, SURFACE_LAYERS, ground_layers, layer_of
+from physics.textures.layers import Layers, encoded, joined_layers, linear
 from physics.textures.noise import Noise, cells
 from physics.textures.walls import prop_layers, wall_layers
 from physics.world.materials import PAVINGS
@@ -68,12 +68,12 @@ def test_a_tint_becomes_the_mean_colour() -> None:
 def test_every_name_in_the_tables_is_a_layer() -> None:
     """Surfaces and styles of walls name layers that exist, and every surface of the ground has one."""
     for names in SURFACE_LAYERS.values():
-        assert set(names) <= set(GROUND)
+        assert set(names) <= set(GROUND_RECIPES)
     walls, facades = set(wall_layers(256).names), set(facade_layers(256).names)
     for style in WALL_STYLES.values():
         assert {*style.walls, *style.roofs} <= walls
         fronts = {bay for name in style.fronts for bay in (DOORS[name].between, DOORS[name].door)}
-        assert {f"{name}-{k}" for name in (*style.uppers, *fronts) for k in range(VARIANTS)} <= facades
+        assert {f"{name}-{k}" for name in (*style.uppers, *fronts) for k in range(BAY_VARIANTS)} <= facades
     assert all(1 <= front.every <= 15 for front in DOORS.values())
     assert {name for names in STREETS.values() for name in names} <= set(WALL_STYLES)
     for surface in (*SURFACES, *PAVINGS):
@@ -131,6 +131,6 @@ def test_wrong_sizes_and_names_are_told() -> None:
     with pytest.raises(UsageError, match=r"unknown texture layer 'lava'\. Valid choices: asphalt,"):
         ground_layers(256).index("lava")
     with pytest.raises(UsageError, match="one size"):
-        joined(ground_layers(256), wall_layers(512))
-    whole = joined(ground_layers(256), wall_layers(256))
+        joined_layers(ground_layers(256), wall_layers(512))
+    whole = joined_layers(ground_layers(256), wall_layers(256))
     assert len(whole) == len(ground_layers(256)) + len(wall_layers(256))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from cosim.core.errors import UsageError
-from cosim.episode.driver import Doing
+from cosim.episode.driver import PolicyCall
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
 
@@ -82,10 +82,10 @@ def test_loading_leaves_the_process_where_it_is(desk: Path) -> None:
 
 def test_loading_is_timed(desk: Path) -> None:
     """Whoever waits for it can be told."""
-    told: list[Doing | None] = []
+    told: list[PolicyCall | None] = []
 
     class Notes:
-        def starts(self, doing: Doing, tick: int) -> None:
+        def starts(self, doing: PolicyCall, tick: int) -> None:
             told.append(doing)
 
         def stops(self) -> None:

@@ -19,7 +19,7 @@ from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, fores
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
 from cosim.policies.route import crossing_limit
-from cosim.spec.events import GROUPS, Kind
+from cosim.spec.events import GROUPS, EventName
 from cosim.spec.scenario import City, CrowdSpec
 
 CITY = City(seed=1, size_m=500.0)
@@ -125,15 +125,15 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
     ("kind", "seed"),
     [*((kind, 1) for kind in GROUPS), ("conversing", 2)],
 )
-def test_the_reference_solver_solves_every_event(kind: Kind, seed: int) -> None:
+def test_the_reference_solver_solves_every_event(kind: EventName, seed: int) -> None:
     """One scenario of each event, with real engines: triggered, seen, its rule kept, its end reached."""
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build
+    from scenarios.builders.reactive import build_reactive
     from scenarios.execution.places import place
     from scenarios.execution.run import run_episode
 
     _, street_map = place(CITY)
-    whole = build(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
+    whole = build_reactive(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
     scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
     record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
@@ -147,7 +147,7 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
     from cosim.core.state import Command
     from cosim.episode.ports import Manifest
     from cosim.place.walk_graph import WalkGraph
-    from scenarios.builders.reactive import build
+    from scenarios.builders.reactive import build_reactive
     from scenarios.execution.places import place
     from scenarios.execution.run import run_episode
 
@@ -161,5 +161,7 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
             return Command(1.2, 0.0)
 
     _, street_map = place(CITY)
-    record = run_episode(build("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()).record
+    record = run_episode(
+        build_reactive("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()
+    ).record
     assert record.ended == "failure" and record.failures[0].other == "e0"

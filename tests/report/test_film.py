@@ -30,13 +30,13 @@ pytestmark = pytest.mark.engine
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
-    from scenarios.builders.long_horizon import build
+    from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build(city, street_map, WalkGraph(street_map), 0, "t-0")
+    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 0, "t-0")
     short = msgspec.structs.replace(
         whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
     )

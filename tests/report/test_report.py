@@ -15,7 +15,7 @@ from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import EVENT, PERSON, ROUTE, Sheet
 from cosim.report.hud import Layout
 from cosim.report.legend import MARGIN_PX, legend
-from cosim.report.minimap import NOSE, REACH_M, RED, Minimap
+from cosim.report.minimap import MINIMAP_REACH_M, NOSE, RED_SIGNAL, Minimap
 from cosim.spec.scenario import City, Scenario
 
 INK = (10, 20, 30)
@@ -99,9 +99,9 @@ def test_the_map_shows_who_is_where_and_faces_where() -> None:
     robot = RobotState(Pose(30.0, 0.0, 0.0))
     people = People.of(("c1", "e0"), [[34.0, 5.0], [36.0, 0.0]], [0.5 * np.pi, np.pi], [1.2, 0.0], ("walk", "stop"))
     image = minimap().picture(robot, Street(0, people), (400, 400), np.array([1.0, 0.0]))
-    px = 400 / (2.0 * REACH_M)
+    px = 400 / (2.0 * MINIMAP_REACH_M)
     middle = 200.0 + px * (np.array([30.0, 0.0]) - (34.0, 0.0)) * (1.0, -1.0)
-    event, other, hand, nose = (where(image, colour) for colour in (EVENT, PERSON, RED, NOSE))
+    event, other, hand, nose = (where(image, colour) for colour in (EVENT, PERSON, RED_SIGNAL, NOSE))
     assert event.mean(axis=0) == pytest.approx(middle + px * np.array([5.9, 0.0]), abs=3.0)
     assert other.mean(axis=0) == pytest.approx(middle + px * np.array([4.0, -5.1]), abs=3.0)
     assert np.ptp(other[:, 1]) > 1.2 * np.ptp(other[:, 0]) and np.ptp(event[:, 0]) > 1.2 * np.ptp(event[:, 1])
@@ -118,7 +118,7 @@ def test_the_map_follows_its_robot() -> None:
         image = one.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)
         assert image.shape == (200, 300, 3)
         shift.append(where(image, EVENT).mean(axis=0))
-    assert shift[0] - shift[1] == pytest.approx((2.0 * 200 / (2.0 * REACH_M), 0.0), abs=0.5)
+    assert shift[0] - shift[1] == pytest.approx((2.0 * 200 / (2.0 * MINIMAP_REACH_M), 0.0), abs=0.5)
 
 
 def test_a_robot_outside_its_map_has_ground_around_it() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import SpecError
-from cosim.spec.events import GROUPS, Actor, Event, EventQuery, EventReply, EventState, Kind
+from cosim.spec.events import GROUPS, Actor, Event, EventName, EventQuery, EventReply, EventState
 from scenarios.events import BEHAVIORS, react
 from scenarios.events.frontal import COMMIT_M
 from scenarios.events.standing import QUEUE_M
@@ -20,7 +20,7 @@ TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
 
 
-def event(kind: Kind, **fields: object) -> Event:
+def event(kind: EventName, **fields: object) -> Event:
     """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
     known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
     known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
@@ -61,7 +61,7 @@ def drive(
         ("lateral", 4.0), ("overtaking", -1.0), ("ped_crossing", 5.0),
     ],
 )  # fmt: skip
-def test_an_event_triggers_at_its_distance(kind: Kind, trigger_m: float) -> None:
+def test_an_event_triggers_at_its_distance(kind: EventName, trigger_m: float) -> None:
     """The trigger fires at the first tick at which the robot is within the distance of the paper's table, overtaking at
     the last one within it behind, a crossing at the end of its crosswalk."""
     track = drive(event(kind), 1100, 1.0)
@@ -137,7 +137,7 @@ def test_the_director_is_stateless() -> None:
 
 def test_every_kind_has_a_behaviour() -> None:
     """All eight of the paper's table."""
-    assert set(BEHAVIORS) == set(get_args(Kind)) == set(GROUPS)
+    assert set(BEHAVIORS) == set(get_args(EventName)) == set(GROUPS)
 
 
 def test_an_event_that_makes_no_sense_is_refused() -> None:

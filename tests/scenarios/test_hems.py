@@ -93,12 +93,12 @@ def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
     """On a map of overlaid sidewalks the same seed gives the same proved route; without the search none, and why."""
     monkeypatch.setattr(long_horizon, "TRIES", 10)
     graph, city = WalkGraph(overlaid), City(seed=1, size_m=500.0)
-    found, again = (long_horizon.build(city, overlaid, graph, 4, "hemmed") for _ in range(2))
+    found, again = (long_horizon.build_long_horizon(city, overlaid, graph, 4, "hemmed") for _ in range(2))
     assert found == again and found.crossings and len(found.barriers) > 10
     assert any(barrier.strip.startswith("over:") for barrier in found.barriers)
     monkeypatch.setattr(long_horizon, "SEARCHES", 0)
     with pytest.raises(SpecError, match=r"^no long-horizon route .* in 10 draws \(.*\), and none was found.*$"):
-        long_horizon.build(city, overlaid, graph, 4, "none")
+        long_horizon.build_long_horizon(city, overlaid, graph, 4, "none")
 
 
 @pytest.mark.engine
@@ -109,5 +109,5 @@ def test_shipped_routes_are_drawn_again_to_the_bit() -> None:
         scenario = shipped[name]
         where = msgspec.structs.replace(scenario.place, net_hash="")
         _, street_map = place(where)
-        drawn = long_horizon.build(where, street_map, WalkGraph(street_map), scenario.seed, name)
+        drawn = long_horizon.build_long_horizon(where, street_map, WalkGraph(street_map), scenario.seed, name)
         assert content_hash(drawn) == content_hash(scenario)

@@ -90,13 +90,13 @@ class War(NamedTuple):
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a suite that has one short scenario for each of them, and the policies."""
-    from scenarios.builders.reactive import build
+    from scenarios.builders.reactive import build_reactive
     from scenarios.execution.places import place
 
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build("obstructing", city, street_map, WalkGraph(street_map), 0, "t")
+    whole = build_reactive("obstructing", city, street_map, WalkGraph(street_map), 0, "t")
     crowd = CrowdSpec(persons=4, radius_m=50.0, vehicles=1)
     one = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=1.0, events=())
     for name, scenarios in (("hostile", [*EXPECTED]), ("pictures", ["honest", "blackens"])):

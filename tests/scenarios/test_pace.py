@@ -137,13 +137,13 @@ def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cach
     cache.mkdir()
     path = cache / pace.FILE
     line = msgspec.json.encode(episodes(1, machine="another")[0])
-    path.write_bytes(b"nonsense\n\xff\n" + (line + b"\n") * (2 * pace.KEPT))
+    path.write_bytes(b"nonsense\n\xff\n" + (line + b"\n") * (2 * pace.EPISODES_KEPT))
     assert recall() == []
     with run_of(tmp_path / "run") as held:
         finished(held, LONG[0], "done")
         with remembered(held, LONG, 1):
             pass
-        assert len(path.read_bytes().splitlines()) == pace.KEPT and len(recall()) == 1
+        assert len(path.read_bytes().splitlines()) == pace.EPISODES_KEPT and len(recall()) == 1
         path.unlink()
         path.mkdir()
         with remembered(held, LONG, 1):

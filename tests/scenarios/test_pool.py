@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from cosim.core.errors import MachineError
-from cosim.episode.driver import Doing
+from cosim.episode.driver import PolicyCall
 from cosim.policies.load import load_policy
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder, RunSpec, read_records
@@ -126,7 +126,7 @@ def test_a_log_keeps_its_beginning_and_its_end(tmp_path: Path, printed: int) -> 
         ("loading", 1e9, 0.0, True),
     ],
 )
-def test_a_first_answer_may_take_longer(doing: Doing, answer_s: float, start_s: float, overdue: bool) -> None:
+def test_a_first_answer_may_take_longer(doing: PolicyCall, answer_s: float, start_s: float, overdue: bool) -> None:
     """What loads a model has a time of its own; nobody is late before anything is asked."""
     asked = Asked.new()
     assert asked.question is None
@@ -143,7 +143,7 @@ def test_a_first_answer_may_take_longer(doing: Doing, answer_s: float, start_s: 
 class Fake:
     """An environment process that says what a test has prepared, and then nothing; or it ends."""
 
-    def __init__(self, *messages: Message, asks: Doing | None = None, ends: bool = False) -> None:
+    def __init__(self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False) -> None:
         self.pipe, self.theirs = Pipe()
         self.asked, self.question = Asked.new(), None
         self.log = Path("worker-0.log")

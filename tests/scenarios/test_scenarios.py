@@ -27,9 +27,9 @@ from cosim.spec.events import Event, EventQuery
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
 from scenarios.builders.build import Proof
-from scenarios.builders.long_horizon import build, on_road_m
+from scenarios.builders.long_horizon import build_long_horizon, on_road_m
 from scenarios.builders.sample import suite_on_map, thinned
-from scenarios.catalog import SUITES, chosen, load_suite
+from scenarios.catalog import SUITES, load_suite, scenarios_chosen
 from scenarios.events import BEHAVIORS, react
 from sumo_nets.maps.mapstore import read_map
 
@@ -85,10 +85,10 @@ def test_every_scenario_comes_with_its_proof(name: str) -> None:
 def test_scenarios_are_chosen_by_event() -> None:
     """All with an event of the kinds asked for; a kind that is not there is answered with those that are."""
     whole = load_suite("reactive")
-    assert {s.events[0].kind for s in chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
-    assert [s.events[0].kind for s in chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
+    assert {s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal", "lateral"])} == {"frontal", "lateral"}
+    assert [s.events[0].kind for s in scenarios_chosen(whole, kinds=["frontal"], episodes=2)] == ["frontal"] * 2
     with pytest.raises(UsageError, match=r"event 'ambush'.*frontal"):
-        chosen(whole, kinds=["ambush"])
+        scenarios_chosen(whole, kinds=["ambush"])
 
 
 def test_a_suite_survives_its_file(tmp_path: Path) -> None:
@@ -264,11 +264,11 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
     """A map with routes has none left when every way is one of stairs."""
     where = CityMap(map="sumo-fkk-in")
     street_map = read_map(where)
-    assert build(where, street_map, WalkGraph(street_map), 0, "plain").crossings
+    assert build_long_horizon(where, street_map, WalkGraph(street_map), 0, "plain").crossings
     steps = {name: dataclasses.replace(strip, going="steps") for name, strip in street_map.strips.items()}
     street_map = dataclasses.replace(street_map, strips=steps)
     with pytest.raises(SpecError) as caught:
-        build(where, street_map, WalkGraph(street_map), 0, "stairs")
+        build_long_horizon(where, street_map, WalkGraph(street_map), 0, "stairs")
     said = str(caught.value)
     assert "the way leads over stairs, a bridge or a tunnel (" in said and "\n" not in said
     assert "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import another area" in said

@@ -11,17 +11,17 @@ import pytest
 
 from cosim.core.state import NOBODY, People
 from cosim.people.neighbours import bystanders
-from cosim.spec.events import Bystander, Event, EventQuery, EventReply, EventState, Kind
+from cosim.spec.events import Bystander, Event, EventName, EventQuery, EventReply, EventState
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import react
-from scenarios.events.guest import actor_of, advanced, arriving
+from scenarios.events.guest import arriving, guest_actor, guest_moved_on
 
 TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
 BOX_M = (0.35, 0.275)
 
 
-def event(kind: Kind, **fields: object) -> Event:
+def event(kind: EventName, **fields: object) -> Event:
     """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
     known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
     known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
@@ -66,8 +66,8 @@ def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
     return float(np.hypot(*away)) - 0.3
 
 
-@pytest.mark.parametrize("kind", get_args(Kind))
-def test_people_who_are_in_nobodys_way_change_nothing(kind: Kind) -> None:
+@pytest.mark.parametrize("kind", get_args(EventName))
+def test_people_who_are_in_nobodys_way_change_nothing(kind: EventName) -> None:
     """To the bit: with somebody who stands off the sidewalk, and without."""
     alone = drive(event(kind), 600, 1.0, 25.0)
     assert drive(event(kind), 600, 1.0, 25.0, Bystander("c1", 50.0, 9.0, 0.0, 0.0)) == alone
@@ -78,7 +78,7 @@ def test_people_who_are_in_nobodys_way_change_nothing(kind: Kind) -> None:
     ("kind", "people"),
     [("conversing", 2), ("conversing", 3), ("conversing", 4), ("queueing", 3), ("queueing", 5), ("ped_crossing", 4)],
 )
-def test_the_people_of_an_event_do_not_walk_through_each_other(kind: Kind, people: int, side: int) -> None:
+def test_the_people_of_an_event_do_not_walk_through_each_other(kind: EventName, people: int, side: int) -> None:
     """Stepping to their places, back, and over a crosswalk; in the end everybody is where it belongs."""
     track = drive(event(kind, people=people, side=side, hold_s=8.0), 900, 0.3, 39.0)
     for _, reply in track:
@@ -138,13 +138,13 @@ def test_a_guest_goes_round_people_and_ends_beside_who_stands_at_its_end() -> No
     ways = []
     for tick in range(400):
         me = Bystander("ei-anna", guest.walker.x_m, guest.walker.y_m, guest.walker.vx_mps, guest.walker.vy_mps)
-        after = advanced(guest, asked(tick, 90.0, 0.0, (*standing, me)))
+        after = guest_moved_on(guest, asked(tick, 90.0, 0.0, (*standing, me)))
         assert after is not None
         guest = after
         ways.append((guest.walker.x_m, guest.walker.y_m))
     assert all(math.dist(xy, (c.x_m, c.y_m)) > 0.55 for xy in ways for c in standing)
     assert guest.arrived_tick is not None and math.dist(ways[-1], (10.0, 5.0)) < 1.0
-    assert actor_of(guest, TICK_MS).speed_mps == 0.0
+    assert guest_actor(guest, TICK_MS).speed_mps == 0.0
 
 
 @pytest.mark.parametrize("names", ["ab", "ba", "abc"])
@@ -157,7 +157,7 @@ def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None
             Bystander(f"ei-{g.injection.id}", g.walker.x_m, g.walker.y_m, g.walker.vx_mps, g.walker.vy_mps)
             for g in guests
         )
-        after = [advanced(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
+        after = [guest_moved_on(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
         guests = [guest for guest in after if guest is not None]
         places = [(g.walker.x_m, g.walker.y_m) for g in guests]
         gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
@@ -186,7 +186,7 @@ def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these
     ],
 )
 def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
-    kind: Kind, people: int, side: int, standing: list[tuple[float, float]]
+    kind: EventName, people: int, side: int, standing: list[tuple[float, float]]
 ) -> None:
     """Where people stand in the way and close to the places, everybody is there within 8 s and stays."""
     crowd = [Bystander(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]

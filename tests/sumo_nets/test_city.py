@@ -16,7 +16,7 @@ import shapely
 from cosim.core.errors import MapError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City
-from sumo_nets.city.blocks import CLASSES, STRIPE_M, corner, curve, direction, length, ring, s_bend, split
+from sumo_nets.city.blocks import CLASSES, WALKWAY_STRIPE_M, corner, curve, direction, length, ring, s_bend, split
 from sumo_nets.city.city import STYLES, plan_city
 from sumo_nets.city.plan import CityPlan
 from sumo_nets.city.signals import signal_faults
@@ -120,7 +120,7 @@ def test_large_city_shows_every_primitive_block() -> None:
 def test_sidewalks_fit_the_stripes_of_the_crowd_model() -> None:
     """Every sidewalk and every crossing is an odd number of 0.64 m stripes wide."""
     for made in CLASSES.values():
-        assert all(round(width / STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
+        assert all(round(width / WALKWAY_STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
 
 
 def test_widths_differ_within_the_ranges_of_the_class() -> None:

@@ -21,7 +21,7 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.policies.route import bearing_to
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import City, CrowdSpec
-from scenarios.builders.crossings import AFTER_M, BEFORE_M, build_all
+from scenarios.builders.crossings import AFTER_M, START_BEFORE_CROSSING_M, build_all
 from scenarios.execution.places import place
 from scenarios.execution.run import run_episode
 from sumo_nets.crowd.crowd import SumoCrowd
@@ -42,7 +42,7 @@ def test_a_crossing_scenario_is_a_short_way_over_one_signalised_crossing() -> No
     for scenario in drawn:
         (crossing,) = scenario.crossings
         assert crossing.signalised and street_map.strips[crossing.id].signalised
-        assert crossing.enter_s_m == pytest.approx(BEFORE_M, abs=0.3)
+        assert crossing.enter_s_m == pytest.approx(START_BEFORE_CROSSING_M, abs=0.3)
         assert scenario.route_line.length_m - crossing.leave_s_m == pytest.approx(AFTER_M, abs=0.5)
         ends = scenario.start[:2], scenario.goal
         assert all(street_map.locate(*end, 0.0).kind == "walk" for end in ends)
@@ -58,7 +58,7 @@ def test_a_city_has_only_so_many_crossings() -> None:
 @pytest.fixture
 def bench(cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
     """What `cosim bench crossings` prints, in small cities."""
-    monkeypatch.setattr("scenarios.bench.crossings.SIZE_M", 600.0)
+    monkeypatch.setattr("scenarios.bench.crossings._SIZE_M", 600.0)
 
     def said(*words: str, cwd: Path | None = None) -> str:
         done = cosim("bench", "crossings", *words, cwd=cwd)

@@ -155,7 +155,7 @@ def test_memory_stays_bounded_while_a_bomb_is_read(tmp_path: Path) -> None:
     """Of a packed net no more is unpacked than is allowed for its size."""
     path = tmp_path / "bomb.net.xml.gz"
     path.write_bytes(zeros(400, lambda data: gzip.compress(data, mtime=0)))
-    with pytest.raises(MapError, match="more than 200 times its size"), rawfile.pieces(path, "gzip") as unpacked:
+    with pytest.raises(MapError, match="more than 200 times its size"), rawfile.file_pieces(path, "gzip") as unpacked:
         most = 0
         for piece in unpacked:
             most += len(piece)

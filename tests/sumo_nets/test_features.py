@@ -24,14 +24,14 @@ from cosim.spec.scenario import CityMap
 from physics.street.buildings import Frontage, facade_meshes
 from physics.street.clearance import clear_width
 from physics.street.furniture import KINDS, footprints
-from physics.street.mapped import HOUSES_M, THINGS_M, MappedThings
-from physics.street.placement import standing
+from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
+from physics.street.placement import props_of
 from physics.world.tiles import TILE_M, keys_within
 from physics.world.world import BulletWorld
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
-from sumo_nets.maps.featurefit import EXTENT_M, WALL_M, fitted
+from sumo_nets.maps.featurefit import EXTENT_M, WALL_GAP_M, fitted
 from sumo_nets.maps.mapstore import about_map, import_map, map_hash, map_net, read_map
-from sumo_nets.maps.osmfeatures import HIGHEST_M, LOWEST_M, Found, Mapped, building_height_m, osm_features
+from sumo_nets.maps.osmfeatures import HIGHEST_BUILDING_M, LOWEST_M, Found, Mapped, building_height_m, osm_features
 from sumo_nets.maps.osmfile import MapFile
 from sumo_nets.maps.utm import utm_xy, utm_zone
 
@@ -162,17 +162,17 @@ def test_streets_win_against_what_stands_in_them(drawn: tuple[StreetMap, tuple[s
     walked = [p.polygon for p in (*street_map.strips.values(), *street_map.corners.values())]
     streets = shapely.union_all([*lanes, *walked])
     buildings = [f for f in street_map.features if f.kind == "building"]
-    assert min(shapely.distance(f.polygon, streets) for f in buildings) > WALL_M - 0.03
+    assert min(shapely.distance(f.polygon, streets) for f in buildings) > WALL_GAP_M - 0.03
     assert sorted(round(f.height_m, 2) for f in buildings) == [12.8, 15.24]
     assert sum(len(f.polygon.interiors) for f in buildings) == 1
     assert {round(math.sin(f.heading_rad)) for f in buildings} == {0}
     assert {(f.y_m > road_axis(street_map)) == (math.cos(f.heading_rad) > 0.9) for f in buildings} == {True}
-    props = [p for p in standing(street_map, 1) if p.id.startswith("prop:map")]
+    props = [p for p in props_of(street_map, 1) if p.id.startswith("prop:map")]
     assert Counter(p.kind for p in props) == {"tree": 3, "lamp": 1, "bench": 1, "bollard": 1}
     roads = shapely.union_all(lanes)
     assert min(shapely.distance(ground, roads) for ground in footprints(props)) > 0.0
     sidewalks = [s for s in street_map.strips.values() if s.kind == "sidewalk"]
-    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, standing(street_map, 1)).values())
+    assert all(free >= min(1.2, bare) - 1e-6 for free, bare in clear_width(sidewalks, props_of(street_map, 1)).values())
 
 
 @pytest.mark.engine
@@ -193,12 +193,12 @@ def test_nothing_is_made_up_where_the_map_shows_it(drawn: tuple[StreetMap, tuple
     bare = dataclasses.replace(street_map, features=())
     (lamp,) = (f for f in street_map.features if f.kind == "lamp")
     away = [
-        sorted(math.hypot(p.x_m - lamp.x_m, p.y_m - lamp.y_m) for p in standing(place, seed) if p.kind == "lamp")
+        sorted(math.hypot(p.x_m - lamp.x_m, p.y_m - lamp.y_m) for p in props_of(place, seed) if p.kind == "lamp")
         for place in (street_map, bare)
         for seed in range(4)
     ]
-    assert all(found[0] == 0.0 and found[1] > THINGS_M for found in away[:4])
-    assert min(map(min, away[4:])) < THINGS_M
+    assert all(found[0] == 0.0 and found[1] > MAPPED_NEAR_M for found in away[:4])
+    assert min(map(min, away[4:])) < MAPPED_NEAR_M
     x0, y0, x1, y1 = street_map.bounds
     keys = keys_within(0.5 * (x0 + x1), 0.5 * (y0 + y1), 300.0)
     rows = [b for key in keys for b in Frontage(street_map, 1, MappedThings(street_map)).in_tile(key)]
@@ -305,7 +305,7 @@ def test_a_scenario_of_other_features_is_refused(drawn: tuple[StreetMap, tuple[s
         ({"height": "40'"}, 12.192, 0), ({"height": "5'6\""}, LOWEST_M, 0), ({"building:levels": "5"}, 16.0, 0),
         ({"height": "tall"}, 9.6, 1), ({"height": "1e9"}, 9.6, 1), ({"height": "99999"}, 9.6, 1),
         ({"height": "-4"}, 9.6, 1), ({"height": "nan", "building:levels": "2"}, 6.4, 1), ({"height": "0"}, 9.6, 0),
-        ({"height": "800"}, HIGHEST_M, 0), ({"building": "garage"}, 3.2, 0), ({"building": "house"}, 6.4, 0),
+        ({"height": "800"}, HIGHEST_BUILDING_M, 0), ({"building": "garage"}, 3.2, 0), ({"building": "house"}, 6.4, 0),
     ],
 )  # fmt: skip
 def test_heights_are_read_as_mappers_write_them(tags: Tags, height_m: float, unread: int) -> None:
@@ -379,7 +379,7 @@ def test_any_tags_are_read_or_counted(tmp_path_factory: pytest.TempPathFactory, 
     for thing in things:
         assert all(np.isfinite(ring).all() for ring in thing.rings) and 0.0 <= thing.height_m < 1000.0
         if thing.kind == "building":
-            assert LOWEST_M <= thing.height_m <= HIGHEST_M
+            assert LOWEST_M <= thing.height_m <= HIGHEST_BUILDING_M
             assert shapely.Polygon(thing.rings[0], thing.rings[1:]).is_valid
 
 
@@ -403,7 +403,7 @@ def test_a_finely_mapped_place_is_built_as_mapped() -> None:
     street_map = read_map("neukoelln")
     counts = Counter(f.kind for f in street_map.features)
     assert counts["building"] > 110 and counts["tree"] > 120 and counts["lamp"] > 38 and counts["bench"] > 14
-    props = standing(street_map, 0)
+    props = props_of(street_map, 0)
     mapped = [p for p in props if p.id.startswith("prop:map")]
     roads = shapely.STRtree([lane.polygon for lane in street_map.lanes.values() if lane.kind == "road"])
     assert not len(roads.query(footprints(mapped), predicate="intersects")[0])

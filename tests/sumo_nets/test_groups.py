@@ -22,7 +22,7 @@ from scenarios.catalog import load_suite, with_crowd
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOW_MPS, Companies, Company
+from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOWEST_GROUP_MPS, Companies, Company
 from sumo_nets.net.netfile import read_net
 
 LINE = np.array([[0.0, 0.0], [50.0, 0.0]])
@@ -84,7 +84,7 @@ def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
     assert ages["child"] / persons == pytest.approx(0.15, abs=0.015)
     assert {company.size for company in drawn} == {1, 2, 3}
     families = [company for company in drawn if "child" in company.ages]
-    assert all("adult" in family.ages and family.pace_mps == SLOW_MPS for family in families)
+    assert all("adult" in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families)
     assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {"adult"})
 
 

@@ -12,7 +12,7 @@ from cosim.core.errors import MapError
 from cosim.spec.scenario import City
 from sumo_nets.city.store import city_net
 from sumo_nets.net.netfile import read_net
-from sumo_nets.net.snapshot import FOLDER, frozen, street_map_of, thawed
+from sumo_nets.net.snapshot import SNAPSHOT_FOLDER, map_as_bytes, street_map_of, thawed
 
 
 @pytest.fixture(scope="module")
@@ -23,14 +23,14 @@ def net() -> Path:
 @pytest.fixture
 def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache" / FOLDER
+    return tmp_path / "cache" / SNAPSHOT_FOLDER
 
 
 def test_a_snapshot_holds_every_value_of_the_map(net: Path) -> None:
     """Ids, numbers, lines and polygons come back equal to the bit, in the same order."""
     read = read_net(net)
-    back = thawed(frozen(read))
-    assert frozen(back) == frozen(read)
+    back = thawed(map_as_bytes(read))
+    assert map_as_bytes(back) == map_as_bytes(read)
     assert (back.name, back.bounds, back.net_hash, back.left_hand) == (
         read.name,
         read.bounds,
@@ -53,19 +53,19 @@ def test_the_second_reading_comes_from_the_snapshot(net: Path, cache: Path, monk
     first = street_map_of(net)
     assert len(list(cache.iterdir())) == 1
     monkeypatch.setattr("sumo_nets.net.snapshot.read_net", lambda _: pytest.fail("parsed again"))
-    assert frozen(street_map_of(net)) == frozen(first)
+    assert map_as_bytes(street_map_of(net)) == map_as_bytes(first)
 
 
 def test_a_damaged_snapshot_is_made_anew(net: Path, cache: Path) -> None:
     """A flipped bit or a cut file costs a reading, not a wrong map."""
-    whole = frozen(street_map_of(net))
+    whole = map_as_bytes(street_map_of(net))
     (kept,) = cache.iterdir()
     sound = kept.read_bytes()
     flipped = bytearray(sound)
     flipped[len(sound) // 2] ^= 16
     for bad in (bytes(flipped), sound[:1000], b""):
         kept.write_bytes(bad)
-        assert frozen(street_map_of(net)) == whole
+        assert map_as_bytes(street_map_of(net)) == whole
         assert kept.read_bytes() == sound
 
 
@@ -74,7 +74,7 @@ def test_another_net_has_another_snapshot(net: Path, cache: Path, tmp_path: Path
     street_map_of(net)
     edited = tmp_path / net.name
     edited.write_bytes(net.read_bytes().replace(b'"frontage_m" value="', b'"frontage_m" value="1'))
-    assert frozen(street_map_of(edited)) != frozen(street_map_of(net))
+    assert map_as_bytes(street_map_of(edited)) != map_as_bytes(street_map_of(net))
     assert len(list(cache.iterdir())) == 2
 
 
@@ -82,7 +82,7 @@ def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, m
     """The map is read all the same."""
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
-    assert frozen(street_map_of(net)) == frozen(read_net(net))
+    assert map_as_bytes(street_map_of(net)) == map_as_bytes(read_net(net))
 
 
 def test_a_missing_net_is_an_error_that_names_it(tmp_path: Path, cache: Path) -> None:

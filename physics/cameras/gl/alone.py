@@ -13,7 +13,7 @@ from cosim.core.geometry import Pose
 from cosim.core.state import Frame, Street
 from cosim.spec.scenario import Light
 from physics.cameras.gl.context import context
-from physics.cameras.gl.crowd import Crowd
+from physics.cameras.gl.crowd import CrowdDrawing
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.cameras.gl.targets import Readback, Target
@@ -33,7 +33,7 @@ class PeopleAlone:
 
     def __enter__(self) -> Self:
         with context() as gl:
-            self._crowd, self._block, self._target = Crowd(gl, False), SceneBlock(gl), Target(gl, self._size)
+            self._crowd, self._block, self._target = CrowdDrawing(gl, False), SceneBlock(gl), Target(gl, self._size)
             self._readback = Readback(gl, self._size)
         self._context = gl
         return self

@@ -26,7 +26,7 @@ from physics.cameras.lens import drawn
 from physics.cameras.view import SIDE_MAX
 from physics.world.world import BulletWorld
 
-Seen = Sequence[tuple[RobotState, Street]]
+_Seen = Sequence[tuple[RobotState, Street]]
 """A robot and its street for each environment."""
 
 
@@ -41,7 +41,7 @@ class Atlas:
             )
         self._cameras = [GlCamera(world, spec, light=light) for world in worlds]
         self._running = ExitStack()
-        self._begun: deque[Seen] = deque()
+        self._begun: deque[_Seen] = deque()
         self._context: moderngl.Context | None = None
 
     def __enter__(self) -> Self:
@@ -62,12 +62,12 @@ class Atlas:
             self._context = None
         self._running.close()
 
-    def render(self, seen: Seen) -> list[Frame]:
+    def render(self, seen: _Seen) -> list[Frame]:
         """What every robot sees, in the order of the worlds."""
         self.begin(seen)
         return self.end()
 
-    def begin(self, seen: Seen) -> None:
+    def begin(self, seen: _Seen) -> None:
         """Draw what every robot sees; `end` hands the pictures over."""
         with self._running_context:
             self._readback.begin()

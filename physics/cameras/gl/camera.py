@@ -21,7 +21,7 @@ from physics.cameras.eyes import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.context import context
 from physics.cameras.gl.lighting import Lighting, lighting_of
-from physics.cameras.gl.scene import Scene
+from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
 from physics.cameras.gl.shadows import ShadowMaps, middle_of
 from physics.cameras.gl.targets import Target
@@ -52,7 +52,7 @@ class GlCamera(WorldCamera):
         if self._context is None:
             world, shadows = self._world, self._light.shadows
             with context() as gl:
-                self._scene = Scene(gl, world.ground, world.barriers, world.model, self._light)
+                self._scene = GlScene(gl, world.ground, world.barriers, world.model, self._light)
                 self._shadows = ShadowMaps(gl) if shadows else None
                 self._block, self._sun_block = SceneBlock(gl), SceneBlock(gl)
                 self._backdrop = Backdrop(gl, self._sky)

@@ -10,24 +10,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from physics.world.mesh import Mesh
 
-CORNER: Final = np.dtype([("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4)])
+_CORNER: Final = np.dtype([("at", "f4", 3), ("normal", "u1", 4), ("colour", "u1", 4)])
 """normal: bytes from -127 to 127, plus 127, for `unpacked` in shading's chunks; the fourths are the drawable's own."""
 
 LAYOUT: Final = ("3f 4f1 4f1", "in_at", "in_normal", "in_colour")
 """CORNER as moderngl wants it."""
 
-Rows = NDArray[np.void]
+CornerRows = NDArray[np.void]
 
 
-def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> Rows:
+def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> CornerRows:
     """(V,) rows of CORNER. colour: rgb from 0 to 1, (3,) or (V, 3); fourth: what goes beside it."""
-    rows = np.zeros(len(mesh.vertices), dtype=CORNER)
+    rows = np.zeros(len(mesh.vertices), dtype=_CORNER)
     rows["at"], rows["normal"][:, :3] = mesh.vertices, np.rint(127.0 * mesh.normals) + 127.0
     rows["colour"][:, :3], rows["colour"][:, 3] = np.rint(255.0 * np.asarray(colour)), fourth
     return rows
 
 
-def joined(parts: Sequence[tuple[Mesh, Rows]]) -> tuple[Rows, NDArray[np.uint32]]:
+def joined_corners(parts: Sequence[tuple[Mesh, CornerRows]]) -> tuple[CornerRows, NDArray[np.uint32]]:
     """The rows of several meshes after each other, and the indices of their triangles, flat."""
     starts = np.cumsum([0, *(len(rows) for _, rows in parts)])
     indices = [(mesh.triangles + start).ravel() for (mesh, _), start in zip(parts, starts, strict=False)]

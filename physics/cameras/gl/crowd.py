@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
-from physics.cameras.gl.shading import Stage
+from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import Shot
-from physics.people.body import COATS, Body, body, far_body
+from physics.people.body import COATS, SkinnedBody, body, far_body
 from physics.people.clips import Clips, own_clips
 from physics.people.figure import LEVELS, MESH_LEVELS
-from physics.people.looks import ALL, look
+from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
 
 LEVEL_PX: Final = (170.0, 60.0, 22.0)
@@ -62,14 +62,14 @@ void main() {
 """
 
 
-class Crowd:
+class CrowdDrawing:
     """The people of a picture. shadows: whether they are shaded by shadow maps.
 
     worn: a body that everybody wears, with clips made for it (`clips_for`), instead of our own.
     """
 
     def __init__(
-        self, context: moderngl.Context, shadows: bool, worn: Body | None = None, clips: Clips | None = None
+        self, context: moderngl.Context, shadows: bool, worn: SkinnedBody | None = None, clips: Clips | None = None
     ) -> None:
         self._context = context
         self._clips = own_clips() if clips is None else clips
@@ -127,7 +127,7 @@ class Crowd:
         self._told.use(1)
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
 
-    def draw(self, stage: Stage) -> None:
+    def draw(self, stage: Pass) -> None:
         """Draw what was set; in the shadow maps of what moves everybody has few triangles."""
         near, far, shadow = self._split
         if stage == "still" or near + far + shadow == 0:
@@ -217,7 +217,7 @@ class Crowd:
 @lru_cache(maxsize=64)
 def _dressed(ids: tuple[str, ...]) -> tuple[NDArray[np.intp], NDArray[np.float32], bytes]:
     """(N,) outfits and girths of people, and their colours as they go up."""
-    looks = [look(name) for name in ids]
+    looks = [look_of(name) for name in ids]
     girth = np.array([who.girth_m for who in looks], dtype=np.float32)
     return np.array([who.outfit for who in looks]), girth, np.stack([who.colours for who in looks]).tobytes()
 

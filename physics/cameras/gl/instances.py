@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.gl.corners import LAYOUT, Rows, corners, joined
-from physics.cameras.gl.shading import Stage, programs
+from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corners
+from physics.cameras.gl.shading import Pass, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
+from physics.textures.layers import Colour
 from physics.world.mesh import Mesh
-
-Colour = tuple[float, float, float]
 
 INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
 """at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its fourth."""
@@ -112,7 +111,7 @@ class Forms:
         return self._ids[key]
 
     def _add(self, key: Hashable, parts: Sequence[Coat]) -> None:
-        rows, indices = joined([(coat.mesh, self._rows(coat)) for coat in parts])
+        rows, indices = joined_corners([(coat.mesh, self._rows(coat)) for coat in parts])
         first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
         self._corners.append(rows)
         self._indices.append(indices)
@@ -124,7 +123,7 @@ class Forms:
         self.draws = np.array(self._starts, dtype=np.uint32)
         self.version += 1
 
-    def _rows(self, coat: Coat) -> Rows:
+    def _rows(self, coat: Coat) -> CornerRows:
         shade = np.ones(len(coat.mesh.vertices)) if coat.shade is None else coat.shade
         colour = np.tile(coat.colour, (len(shade), 1)) if coat.colour else np.ones((len(shade), 3))
         rows = corners(coat.mesh, colour * shade[:, None], _GLOW if coat.glows else _OWN if coat.colour else _PAINT)
@@ -150,7 +149,7 @@ class Forms:
 class Things:
     """A set of instances, replaced as a whole, drawn in one call. stages: the passes in which it is drawn."""
 
-    def __init__(self, context: moderngl.Context, forms: Forms, stages: Sequence[Stage]) -> None:
+    def __init__(self, context: moderngl.Context, forms: Forms, stages: Sequence[Pass]) -> None:
         self._context, self._forms, self._stages = context, forms, stages
         self._bound = -1
         self._room = 0
@@ -178,7 +177,7 @@ class Things:
         self._instances.write(rows[order])
         self._commands.write(commands)
 
-    def draw(self, stage: Stage) -> None:
+    def draw(self, stage: Pass) -> None:
         if self._count and stage in self._stages:
             if self._bound != self._forms.version:
                 self._bind()
@@ -216,7 +215,7 @@ class Things:
         self._room = self._count = 0
 
 
-def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int, about_y: ArrayLike = 0.0) -> Rows:
+def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int, about_y: ArrayLike = 0.0) -> CornerRows:
     """Rows of INSTANCE. at: (N, 3) from the anchor; heading, about_y: radians, a turn about the thing's own y axis
     comes first; paint: (N, 3) or (3,)."""
     at = np.asarray(at, dtype=float).reshape(-1, 3)

@@ -16,13 +16,13 @@ from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, RobotState, Street, Vehicles
 from cosim.spec.scenario import Barrier
-from physics.cameras.gl.corners import Rows
-from physics.cameras.gl.crowd import Crowd
+from physics.cameras.gl.corners import CornerRows
+from physics.cameras.gl.crowd import CrowdDrawing
 from physics.cameras.gl.instances import INSTANCE, Coat, Forms, Things, instances
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.robot_body import robot_parts
-from physics.cameras.gl.shading import Stage
-from physics.cameras.gl.shadows import REACH_M, STEP_M, middle_of
+from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.shadows import SHADOW_REACH_M, STEP_M, middle_of
 from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.tiles import TileBuffers, ground_parts, paint_parts, tile_shaders
 from physics.cameras.gl.walls import WallBuffers, wall_shaders
@@ -30,6 +30,7 @@ from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHIC
 from physics.robots import RobotModel
 from physics.street import props, vehicles
 from physics.street.furniture import KINDS, Prop, parts_of
+from physics.textures.layers import Colour
 from physics.world.ground import Ground
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
 
@@ -38,10 +39,10 @@ CAST_M: Final = 18.0
 _TILE_REACH_M: Final = 34.0
 """A tile's farthest point from its middle, and what stands over its border."""
 
-Placed = tuple[NDArray[np.int64], Rows]
+_Placed = tuple[NDArray[np.int64], CornerRows]
 """Numbers of forms and rows of instances."""
 _CLOCK: Final = Clock()
-_NOTHING: Final[Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTANCE))
+_NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTANCE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +54,7 @@ class _Tile:
     ground: TileBuffers
     paint: TileBuffers | None
     walls: WallBuffers
-    things: Placed
+    things: _Placed
     thing_xy: Floats
     seen_m: Floats
     posts: list[props.SignalPost]
@@ -66,7 +67,7 @@ class _Tile:
         self.walls.release()
 
 
-class Scene:
+class GlScene:
     """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
 
     def __init__(
@@ -87,19 +88,19 @@ class Scene:
         self._keys: list[Key] = []
         self._anchor: Floats = np.zeros(2)
         self._stands_for: tuple[frozenset[Key], Floats] | None = None
-        self._stands: Placed = _NOTHING
+        self._stands: _Placed = _NOTHING
         self._stands_xy: Floats = np.zeros((0, 2))
         self._stands_seen_m: Floats = np.zeros(0)
         self._posts: list[tuple[props.SignalPost, float]] = []
         self._lit_for: list[bool | None] = []
-        self._lit: Placed = _NOTHING
+        self._lit: _Placed = _NOTHING
         self._around: list[_Tile] = []
         self._middles: Floats = np.zeros((0, 2))
         self._in_view: list[_Tile] = []
         self._fences = [self._fence(barrier) for barrier in barriers]
         self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
-        self._fleet: dict[tuple[str, float, float], tuple[int, vehicles.Colour]] = {}
-        self._crowd = Crowd(context, shadows)
+        self._fleet: dict[tuple[str, float, float], tuple[int, Colour]] = {}
+        self._crowd = CrowdDrawing(context, shadows)
 
     def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None, body: bool) -> None:
         """Hold everything that a picture can show. body: the robot itself is in the picture, not its shadow alone."""
@@ -137,7 +138,7 @@ class Scene:
             _set(self._standing, [*rows, *self._fences_now()])
             self._still_for = still
 
-    def draw(self, stage: Stage) -> None:
+    def draw(self, stage: Pass) -> None:
         """Draw what was arranged: the small and near first, then the ground from near to far."""
         self._crowd.draw(stage)
         if stage == "colour":
@@ -209,7 +210,7 @@ class Scene:
             lambda: [Coat(part.mesh, part.colour, False, part.cover, part.shade) for part in parts_of(*prop.form)],
         )
 
-    def _things(self, view: View) -> Placed:
+    def _things(self, view: View) -> _Placed:
         """What stands in the tiles around, as far as it is drawn."""
         keys = frozenset(self._keys)
         if self._stands_for is None or self._stands_for[0] != keys or self._stands_for[1] is not self._anchor:
@@ -225,21 +226,21 @@ class Scene:
         form, things = self._stands
         return form[rows], things[rows]
 
-    def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> Placed:
+    def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> _Placed:
         form, things = tile.things
         here = things[rows]
         here["at"][:, :2] += tile.middle - self._anchor
         return form[rows], here
 
-    def _fence(self, barrier: Barrier) -> Placed:
+    def _fence(self, barrier: Barrier) -> _Placed:
         z = self._ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
-        form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.RED), Coat(white, props.WHITE)])
-        rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.RED, LABELS["barrier"])
+        form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.PROP_RED), Coat(white, props.PROP_WHITE)])
+        rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
         return np.array([form]), rows
 
-    def _fences_now(self) -> list[Placed]:
+    def _fences_now(self) -> list[_Placed]:
         placed = []
         for (form, rows), xy in zip(self._fences, self._fence_xy, strict=True):
             here = rows.copy()
@@ -247,7 +248,7 @@ class Scene:
             placed.append((form, here))
         return placed
 
-    def _lamps(self, street: Street) -> Placed:
+    def _lamps(self, street: Street) -> _Placed:
         """The lit lamp of every signal whose state is known; after `_things`."""
         signals = street.signals
         shown = [signals[post.crossing].walk if post.crossing in signals else None for post, _ in self._posts]
@@ -255,7 +256,7 @@ class Scene:
             self._lit_for, self._lit = shown, self._lamps_showing(shown)
         return self._lit
 
-    def _lamps_showing(self, shown: list[bool | None]) -> Placed:
+    def _lamps_showing(self, shown: list[bool | None]) -> _Placed:
         lit = {walk: self._forms.id(("signal", walk), partial(_lamp, walk)) for walk in props.LAMPS}
         forms, at, heading, paint = [], [], [], []
         for (post, z), walk in zip(self._posts, shown, strict=True):
@@ -268,10 +269,10 @@ class Scene:
             return _NOTHING
         return np.array(forms), instances(at, heading, paint, LABELS["signal"])
 
-    def _vehicles(self, view: View, middle: Floats, which: Vehicles) -> tuple[Placed, Placed]:
+    def _vehicles(self, view: View, middle: Floats, which: Vehicles) -> tuple[_Placed, _Placed]:
         """Vehicles in the picture, and those that throw shadows in the square around its middle."""
         seen = view.sees(which.xy, VEHICLE_MARGIN_M)
-        casts = _near(which.xy, middle, REACH_M)
+        casts = _near(which.xy, middle, SHADOW_REACH_M)
         rows = (seen | casts if self._shadows else seen).nonzero()[0]
         if not len(rows):
             return _NOTHING, _NOTHING
@@ -284,7 +285,7 @@ class Scene:
         seen, casts = seen[rows], casts[rows]
         return (form[seen], placed[seen]), (form[casts], placed[casts])
 
-    def _vehicle_form(self, name: str, length_m: float, width_m: float) -> tuple[int, vehicles.Colour]:
+    def _vehicle_form(self, name: str, length_m: float, width_m: float) -> tuple[int, Colour]:
         """The form of a vehicle, and its paint."""
         key = name, length_m, width_m
         if key not in self._fleet:
@@ -294,7 +295,7 @@ class Scene:
             self._fleet[key] = form, vehicles.paint(name)
         return self._fleet[key]
 
-    def _robot(self, robot: RobotState) -> Placed:
+    def _robot(self, robot: RobotState) -> _Placed:
         """The robot with its base frame at its pose, leaning with the ground."""
         form = self._forms.id(("robot", self._model.name), partial(robot_parts, self._model.urdf))
         _, roll, pitch = self._ground.lean(robot.pose, self._model)
@@ -312,7 +313,7 @@ def _vehicle(shape: vehicles.Shape, length_m: float, width_m: float) -> list[Coa
     return [Coat(part.mesh, part.colour) for part in vehicles.vehicle_parts(shape, length_m, width_m)]
 
 
-def _set(things: Things, placed: Sequence[Placed]) -> None:
+def _set(things: Things, placed: Sequence[_Placed]) -> None:
     things.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
 
 

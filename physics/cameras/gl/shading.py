@@ -52,9 +52,9 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.view import FAR_M, NEAR_M, Shot
+from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M, Shot
 
-Stage = Literal["colour", "still", "moving"]
+Pass = Literal["colour", "still", "moving"]
 
 SCENE_BINDING: Final = 0
 FINISH_UNIT: Final = 2
@@ -69,7 +69,7 @@ ANCHOR_M: Final = 64.0
 class Drawable(Protocol):
     """Something that is drawn."""
 
-    def draw(self, stage: Stage) -> None: ...
+    def draw(self, stage: Pass) -> None: ...
 
 
 class Programs(NamedTuple):
@@ -184,7 +184,7 @@ def anchor_of(eye_m: Floats) -> Floats:
 def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
     """(4, 4) from metres relative to the anchor to clip space, the first row of the picture below (read top first)."""
     wide, tall = shot.half_picture
-    far, near = FAR_M, NEAR_M
+    far, near = FAR_PLANE_M, NEAR_PLANE_M
     matrix = np.empty((4, 4))
     matrix[:3, :3] = shot.axes
     matrix[3, :3] = matrix[2, :3]

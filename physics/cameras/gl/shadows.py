@@ -14,9 +14,9 @@ import numpy as np
 
 from cosim.core.geometry import Floats
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Stage
+from physics.cameras.gl.shading import MOVING_UNIT, STILL_UNIT, Pass
 
-REACH_M: Final = 32.0
+SHADOW_REACH_M: Final = 32.0
 """Half the side of the square that has shadows."""
 STEP_M: Final = 8.0
 """The lattice of the box's middles."""
@@ -36,11 +36,11 @@ def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
     across = np.cross((0.0, 0.0, 1.0), sun)
     across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
     rows = np.stack([across, np.cross(sun, across), -sun])
-    texel = 2.0 * REACH_M / _STILL_PX
+    texel = 2.0 * SHADOW_REACH_M / _STILL_PX
     centre = rows @ middle
     centre[:2] = np.round(centre[:2] / texel) * texel
     shift = rows @ np.array([*anchor, 0.0]) - centre
-    scale = np.array([1.0 / REACH_M, 1.0 / REACH_M, 1.0 / _DEEP_M])
+    scale = np.array([1.0 / SHADOW_REACH_M, 1.0 / SHADOW_REACH_M, 1.0 / _DEEP_M])
     matrix = np.eye(4)
     matrix[:3, :3], matrix[:3, 3] = rows * scale[:, None], shift * scale
     return matrix
@@ -74,7 +74,7 @@ class ShadowMaps:
             self._matrix_for, self._matrix = key, shadow_matrix(middle, anchor, light.to_sun)
         return self._matrix
 
-    def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Stage], None]) -> None:
+    def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]) -> None:
         """Bring the maps up to date; the scene block must hold their matrix as its camera."""
         self._context.enable_only(moderngl.DEPTH_TEST)
         self._context.depth_func = "<"
@@ -86,7 +86,7 @@ class ShadowMaps:
         self._draw("moving", draw)
         self._context.polygon_offset = 0.0, 0.0
 
-    def _draw(self, stage: Stage, draw: Callable[[Stage], None]) -> None:
+    def _draw(self, stage: Pass, draw: Callable[[Pass], None]) -> None:
         frame = self._frames[stage]
         frame.use()
         frame.clear(depth=1.0)

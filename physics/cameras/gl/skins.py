@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.state import LABELS
-from physics.cameras.gl.shading import Programs, Stage, programs
-from physics.people.body import Body, FarBody
+from physics.cameras.gl.shading import Pass, Programs, programs
+from physics.people.body import FarBody, SkinnedBody
 
-CORNER: Final = np.dtype(
+_CORNER: Final = np.dtype(
     [("at", "f4", 3), ("normal", "u1", 4), ("joints", "u1", 4), ("weights", "u1", 4), ("coat", "u1", 4)]
 )
-"""normal: as in corners.CORNER, its fourth how far fat stands out; weights: of 255; coat: row of COATS, three spare."""
+"""normal: as in corners._CORNER, fourth: how far fat stands out; weights: of 255; coat: row of COATS."""
 
 FAR_CORNER: Final = np.dtype(
     [
@@ -111,7 +111,7 @@ class Skins:
     def __init__(
         self,
         context: moderngl.Context,
-        made: Callable[[int, int], Body | FarBody],
+        made: Callable[[int, int], SkinnedBody | FarBody],
         drawn: Programs,
         layout: tuple[str, ...],
     ) -> None:
@@ -125,12 +125,12 @@ class Skins:
         """Take in a body: count of indices, first index, first vertex."""
         made = self._made(outfit, level)
         first, base = sum(map(len, self._indices)), sum(map(len, self._rows))
-        self._rows.append(corners(made) if isinstance(made, Body) else far_corners(made))
+        self._rows.append(_corners(made) if isinstance(made, SkinnedBody) else far_corners(made))
         self._indices.append(made.triangles.ravel().astype(np.uint32))
         self.release()
         return len(self._indices[-1]), first, base
 
-    def draw(self, stage: Stage, instances: moderngl.Buffer, commands: moderngl.Buffer, count: int, first: int) -> None:
+    def draw(self, stage: Pass, instances: moderngl.Buffer, commands: moderngl.Buffer, count: int, first: int) -> None:
         """So many indirect draws, from the `first` on."""
         if not count:
             return
@@ -154,7 +154,7 @@ class Skins:
         self._held, self._arrays = [colour, shadow, corner, index], (colour, shadow)
 
 
-def mesh_skins(context: moderngl.Context, made: Callable[[int, int], Body], shadows: bool) -> Skins:
+def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody], shadows: bool) -> Skins:
     """Meshes, four joints to a corner."""
     return Skins(context, made, programs(context, _SKIN + _MESH, _FRAGMENT, shadows), _MESH_LAYOUT)
 
@@ -168,9 +168,9 @@ def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody], s
     return Skins(context, made, Programs(seen.colour, cast.shadow), _TUBE_LAYOUT)
 
 
-def corners(made: Body) -> NDArray[np.void]:
+def _corners(made: SkinnedBody) -> NDArray[np.void]:
     """(V,) rows of CORNER."""
-    rows = np.zeros(len(made.vertices), dtype=CORNER)
+    rows = np.zeros(len(made.vertices), dtype=_CORNER)
     rows["at"] = made.vertices
     rows["normal"][:, :3] = np.rint(127.0 * made.normals) + 127.0
     rows["normal"][:, 3] = np.rint(255.0 * made.fat)

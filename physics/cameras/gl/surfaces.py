@@ -14,7 +14,7 @@ from cosim.core.geometry import Floats
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
-from physics.textures.layers import Layers, joined
+from physics.textures.layers import Layers, joined_layers
 from physics.textures.walls import prop_layers, wall_layers
 
 SIZE_PX: Final = 256
@@ -63,7 +63,7 @@ class SurfaceShaders:
                 uniform.write(surfaces.known)
 
 
-class Spot:
+class TilePlace:
     """Where a tile is, as its programs read it. middle: (2,) world metres."""
 
     def __init__(self, context: moderngl.Context, middle: Floats) -> None:
@@ -84,7 +84,10 @@ class Spot:
 @lru_cache(maxsize=1)
 def surfaces(context: moderngl.Context) -> Surfaces:
     """Made once in a context; they stay as long as it."""
-    flat, facades = joined(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX)), facade_layers(SIZE_PX)
+    flat, facades = (
+        joined_layers(ground_layers(SIZE_PX), wall_layers(SIZE_PX), prop_layers(SIZE_PX)),
+        facade_layers(SIZE_PX),
+    )
     known = np.ones((LAYERS_MAX, 4), dtype=np.float32)
     known[: len(flat), :3], known[: len(flat), 3] = flat.mean, flat.metres[:, 0]
     assert facades.finish is not None

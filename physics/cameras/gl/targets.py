@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
-from physics.cameras.view import FAR_M, NEAR_M
+from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
 
 class Target:
@@ -45,7 +45,7 @@ class Target:
         width, height = self.size
         data = self.frame.read(components=1, attachment=-1, dtype="f4")
         depth = np.frombuffer(data, dtype=np.float32).reshape(height, width)
-        return (FAR_M * NEAR_M / (FAR_M - (FAR_M - NEAR_M) * depth)).astype(np.float32)
+        return (FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)).astype(np.float32)
 
     def release(self) -> None:
         for thing in (self.frame, self._colour, self._depth):

@@ -10,9 +10,9 @@ import moderngl
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from cosim.place.street_map import StreetMap
-from physics.cameras.gl.corners import LAYOUT, corners, joined
-from physics.cameras.gl.shading import Stage
-from physics.cameras.gl.surfaces import Spot, Surfaces, SurfaceShaders
+from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
+from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
 from physics.street.frontage import frontage_in
 from physics.street.paint import paint_in
 from physics.textures.ground import layer_of
@@ -92,15 +92,15 @@ class TileBuffers:
             rows = corners(here, tint or (0.0, 0.0, 0.0), LABELS[label] + (_TINTED if tint else 0))
             rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
             parts.append((here, rows))
-        rows, triangles = joined(parts)
-        self._spot = Spot(context, middle)
+        rows, triangles = joined_corners(parts)
+        self._spot = TilePlace(context, middle)
         self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
         content = [(self._corners, *LAYOUT), self._spot.content]
         self._arrays = [
             context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders.programs
         ]
 
-    def draw(self, stage: Stage, anchor: Floats) -> None:
+    def draw(self, stage: Pass, anchor: Floats) -> None:
         if stage != "moving":
             self._spot.seen_from(anchor)
             self._arrays[stage != "colour"].render()

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
 from cosim.place.street_map import StreetMap
-from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, Stage
-from physics.cameras.gl.surfaces import Spot, Surfaces, SurfaceShaders
+from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, Pass
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
 from physics.street.buildings import Building, facade_meshes
-from physics.street.fronts import LEAST_M, face_of, style_of
+from physics.street.fronts import NARROWEST_FRONT_M, face_of, style_of
 from physics.textures.facade_canvas import BAY_M, STOREY_M
-from physics.textures.facades import VARIANTS, WallStyle
+from physics.textures.facades import BAY_VARIANTS, WallStyle
 from physics.world.mesh import Mesh
 from physics.world.tiles import CURB_M
 
@@ -75,7 +75,7 @@ void main() {{
     bool ground_floor = cell.y < 0.5 && kind.z > 0.5;
     float every = floor(fronts.z / 16.0);
     float front = abs(mod(cell.x, every) - (fronts.z - 16.0 * every)) < 0.5 ? fronts.y : fronts.x;
-    float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {VARIANTS}.0);
+    float layer = ground_floor ? front : kind.x + floor(fract(drawn * 17.0) * {BAY_VARIANTS}.0);
     float up = ground_floor ? clamp(cells.y, 0.006, 0.994) : cells.y;  // its plinth does not show over its top
     vec4 bay = texture(facades, vec3(cells.x, -up, layer));
     bool none = cell.y < 0.0 || cell.y >= kind.y;
@@ -107,7 +107,7 @@ class WallBuffers:
         street_map: StreetMap,
         middle: Floats,
     ) -> None:
-        self._spot = Spot(context, middle)
+        self._spot = TilePlace(context, middle)
         parts = [rows for b in buildings for rows in _rows(b, style_of(b, street_map), shaders.surfaces, middle)]
         self._arrays: list[moderngl.VertexArray] = []
         self._buffers: list[moderngl.Buffer] = []
@@ -122,7 +122,7 @@ class WallBuffers:
             context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in shaders.programs
         ]
 
-    def draw(self, stage: Stage, anchor: Floats) -> None:
+    def draw(self, stage: Pass, anchor: Floats) -> None:
         if self._arrays and stage != "moving":
             self._spot.seen_from(anchor)
             self._arrays[stage != "colour"].render()
@@ -183,5 +183,5 @@ def _spots(mesh: Mesh, flat: NDArray[np.bool_], floor_m: float) -> tuple[Floats,
         width = along.max()
         count = max(round(width / BAY_M), 1)
         spots[quad] = np.stack([along, up, along / width * count, up / STOREY_M], axis=1)
-        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= LEAST_M and up.max() > 0.0 else 0
+        storeys[quad] = max(int((up.max() + 0.3) / STOREY_M), 1) if width >= NARROWEST_FRONT_M and up.max() > 0.0 else 0
     return spots, storeys

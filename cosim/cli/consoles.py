@@ -1,0 +1,6 @@
+"""What the command line writes to: results to stdout, everything else to stderr."""
+
+from rich.console import Console
+
+out = Console()
+err = Console(stderr=True)
