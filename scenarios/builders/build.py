@@ -1,21 +1,24 @@
 """Building the shipped suites: candidates are drawn, and the expert proves each solvable before it is kept.
 
 python -m scenarios.builders.build long-horizon OUT.json
-python -m scenarios.builders.build reactive OUT.json
+python -m scenarios.builders.build reactive OUT.json --jobs 16
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from itertools import repeat
+from multiprocessing import get_context
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import msgspec
+import typer
 
-from cosim.core.errors import unknown
+from cosim.core.errors import SpecError
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.records.record import Record
@@ -26,10 +29,13 @@ from scenarios.execution.places import place
 from scenarios.execution.run import run_episode
 from sumo_nets.city.seeds import shipped_cities
 
-CITY_SEEDS = (11, 23, 37, 41)
-PER_CITY = 3
-REACTIVE_CITIES = 20
-TRIES_PER_SCENARIO = 6
+_CITIES = tuple(City(seed=seed) for seed in (11, 23, 37, 41))
+_PER_CITY = 3
+_REACTIVE_CITIES = 20
+_TRIES_PER_SCENARIO = 6
+
+
+SuiteName = Literal["long-horizon", "reactive"]
 
 
 class Proof(msgspec.Struct, frozen=True):
@@ -51,69 +57,81 @@ class Candidates(NamedTuple):
     draw: Callable[[int], Scenario]
 
 
+class Proved(NamedTuple):
+    """A scenario that is kept. dropped: why earlier candidates were not."""
+
+    scenario: Scenario
+    proof: Proof
+    dropped: list[str]
+
+
 class _Recipe(NamedTuple):
-    """How a suite is made. candidates: scenario by scenario, those of one place together: a place is read once."""
+    """How a suite is made. candidates: of the scenarios in one of its cities, told its number."""
 
     version: str
     description: str
     expert: str
-    candidates: Callable[[], Iterator[Candidates]]
+    cities: tuple[City, ...]
+    candidates: Callable[[City, int], Iterator[Candidates]]
 
 
-def long_horizon_candidates() -> Iterator[Candidates]:
-    """A few ways in each of a few cities."""
-    for seed in CITY_SEEDS:
-        city = City(seed=seed)
-        _, street_map = place(city)
-        graph = WalkGraph(street_map)
-        for number in range(PER_CITY):
-            name = f"lh-{seed:03d}-{number:02d}"
-            yield Candidates(
-                name, number, partial(long_horizon.build_long_horizon, city, street_map, graph, scenario_id=name)
-            )
+def long_horizon_candidates(city: City, _number: int) -> Iterator[Candidates]:
+    """A few ways in a city."""
+    _, street_map = place(city)
+    graph = WalkGraph(street_map)
+    for number in range(_PER_CITY):
+        name = f"lh-{city.seed:03d}-{number:02d}"
+        draw = partial(long_horizon.build_long_horizon, city, street_map, graph, scenario_id=name)
+        yield Candidates(name, number, draw)
 
 
-def reactive_candidates() -> Iterator[Candidates]:
-    """Every event in each of the first shipped cities."""
-    for number, city in enumerate(shipped_cities(REACTIVE_CITIES)):
-        _, street_map = place(city)
-        graph = WalkGraph(street_map)
-        for kind in GROUPS:
-            name = f"{kind}-{city.seed:03d}"
-            yield Candidates(
-                name, number, partial(reactive.build_reactive, kind, city, street_map, graph, scenario_id=name)
-            )
+def reactive_candidates(city: City, number: int) -> Iterator[Candidates]:
+    """Every event in a city."""
+    _, street_map = place(city)
+    graph = WalkGraph(street_map)
+    for kind in GROUPS:
+        name = f"{kind}-{city.seed:03d}"
+        yield Candidates(
+            name, number, partial(reactive.build_reactive, kind, city, street_map, graph, scenario_id=name)
+        )
 
 
-RECIPES: Mapping[str, _Recipe] = MappingProxyType(
+RECIPES: Mapping[SuiteName, _Recipe] = MappingProxyType(
     {
         "long-horizon": _Recipe(
             version="0.2",
             description="Start and goal more than 100 m apart in generated cities; one walkable path; street life.",
             expert="route",
+            cities=_CITIES,
             candidates=long_horizon_candidates,
         ),
         "reactive": _Recipe(
             version="0.1",
             description="10 to 20 m of way with one event of pedestrians on it, each event in the same cities.",
             expert="orca",
+            cities=shipped_cities(_REACTIVE_CITIES),
             candidates=reactive_candidates,
         ),
     }
 )
 
 
-def proved(candidates: Candidates, expert: str) -> tuple[Scenario, Proof, list[str]]:
-    """The first candidate that the expert solves, its proof, and why earlier ones were dropped."""
+def proved(candidates: Candidates, expert: str) -> Proved:
+    """The first candidate that the expert solves."""
     dropped: list[str] = []
-    for attempt in range(TRIES_PER_SCENARIO):
-        scenario = candidates.draw(1000 * attempt + candidates.number)
+    for attempt in range(_TRIES_PER_SCENARIO):
+        seed = 1000 * attempt + candidates.number
+        try:
+            scenario = candidates.draw(seed)
+        except SpecError as error:
+            dropped.append(f"seed {seed}: {error}")
+            continue
         record = run_episode(scenario, load_policy(expert)).record
         if record.status == "done" and record.measures["success"] == 1.0:
-            return scenario, proof_of(scenario, record, expert), dropped
+            return Proved(scenario, proof_of(scenario, record, expert), dropped)
         told = [f"{f.kind} {f.other_kind} at {f.route_s_m:.0f} m" for f in record.failures]
         dropped.append(f"seed {scenario.seed}: {record.status} {record.reason} {record.ended} {told}")
-    raise SystemExit(f"{candidates.name}: the expert solved none of {TRIES_PER_SCENARIO} candidates: {dropped}")
+    raise SystemExit(f"{candidates.name}: the expert solved none of {_TRIES_PER_SCENARIO} candidates: {dropped}")
 
 
 def proof_of(scenario: Scenario, record: Record, expert: str) -> Proof:
@@ -124,25 +142,37 @@ def proof_of(scenario: Scenario, record: Record, expert: str) -> Proof:
     )  # fmt: skip
 
 
-def build_suite(name: str, out: Path) -> None:
-    """Build a suite at `out`, its proofs beside it."""
-    if name not in RECIPES:
-        raise unknown("suite", name, RECIPES)
+def build_suite(
+    name: SuiteName,
+    out: Path,
+    jobs: Annotated[int, typer.Option(min=1, help="Cities at a time, each in a process of its own.")] = 1,
+) -> None:
+    """Build a suite at OUT, its proofs beside it. The same suite comes of any number of jobs."""
     recipe = RECIPES[name]
-    scenarios, proofs, redrawn = [], [], 0
-    for candidates in recipe.candidates():
-        scenario, proof, dropped = proved(candidates, recipe.expert)
-        scenarios.append(scenario)
-        proofs.append(proof)
-        redrawn += bool(dropped)
-        print(
-            f"{scenario.id}: {scenario.route_line.length_m:.0f} m, {proof.time_s:.0f} s; dropped: {dropped}", flush=True
-        )
-    print(f"{len(scenarios) - redrawn} of {len(scenarios)} first candidates solved by '{recipe.expert}'")
-    suite = Suite(name=name, version=recipe.version, description=recipe.description, scenarios=tuple(scenarios))
+    kept: list[Proved] = []
+    with ProcessPoolExecutor(jobs, get_context("spawn"), max_tasks_per_child=1) as pool:
+        for found in pool.map(_in_city, repeat(name), range(len(recipe.cities))):
+            kept += found
+            for scenario, proof, dropped in found:
+                way = f"{scenario.route_line.length_m:.0f} m, {proof.time_s:.0f} s"
+                print(f"{scenario.id}: {way}; dropped: {dropped}", flush=True)
+    first = sum(not one.dropped for one in kept)
+    print(f"{first} of {len(kept)} first candidates solved by '{recipe.expert}'")
+    suite = Suite(
+        name=name,
+        version=recipe.version,
+        description=recipe.description,
+        scenarios=tuple(one.scenario for one in kept),
+    )
     write_suite(suite, out)
-    out.with_suffix(".proof.json").write_bytes(msgspec.json.format(msgspec.json.encode(proofs), indent=1) + b"\n")
+    proofs = msgspec.json.encode([one.proof for one in kept])
+    out.with_suffix(".proof.json").write_bytes(msgspec.json.format(proofs, indent=1) + b"\n")
+
+
+def _in_city(name: SuiteName, number: int) -> list[Proved]:
+    recipe = RECIPES[name]
+    return [proved(one, recipe.expert) for one in recipe.candidates(recipe.cities[number], number)]
 
 
 if __name__ == "__main__":
-    build_suite(sys.argv[1], Path(sys.argv[2]))
+    typer.run(build_suite)
