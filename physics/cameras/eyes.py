@@ -57,7 +57,7 @@ class WorldCamera(ABC):
 
     def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
         """What the lens makes of a picture as the robot's pinhole camera would see it."""
-        return through(self.spec, frame, robot, self._world.ground.seed, street.tick)
+        return through(self.spec, frame, robot, self._world.surface.seed, street.tick)
 
     def _mounted(self, robot: RobotState) -> Shot:
-        return robot_shot(self._world.ground, self._world.model, self._pinhole, robot)
+        return robot_shot(self._world.surface, self._world.model, self._pinhole, robot)

@@ -22,8 +22,8 @@ from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
-from physics.world.ground import Ground
-from physics.world.tiles import Key, distance_to, keys_within, square, surface
+from physics.world.surface import Surface
+from physics.world.tiles import Key, distance_to, keys_within, square
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,9 +44,9 @@ class BulletScene:
     built: number of tiles made since the start.
     """
 
-    def __init__(self, canvas: BulletCanvas, ground: Ground, barriers: Sequence[Barrier], model: RobotModel) -> None:
+    def __init__(self, canvas: BulletCanvas, surface: Surface, barriers: Sequence[Barrier], model: RobotModel) -> None:
         self._canvas = canvas
-        self._ground = ground
+        self._surface = surface
         self._model = model
         self._tiles: dict[Key, _TileBodies] = {}
         self._shown: set[Key] = set()
@@ -60,7 +60,7 @@ class BulletScene:
         self._robot = canvas.load(model.urdf, "robot")
         for barrier in barriers:
             size = (barrier.thickness_m, barrier.length_m)
-            z = ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
+            z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
             for mesh, colour in zip(props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True):
                 body = canvas.add(mesh, colour, "barrier")
                 canvas.put(body, (barrier.x_m, barrier.y_m, z), barrier.heading_rad)
@@ -102,8 +102,9 @@ class BulletScene:
     def _built(self, key: Key) -> _TileBodies:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.0])
-        parts = [(mesh, *surface(name)[::-1]) for name, mesh in self._ground.tile(key).parts.items()]
-        for facade, mesh in facade_meshes(self._ground.buildings(key)).items():
+        chunk, posts = self._surface.chunk(key), self._surface.posts(key)
+        parts = [(patch.mesh, patch.colour, patch.label) for patch in chunk.ground]
+        for facade, mesh in facade_meshes(chunk.buildings).items():
             parts.append((mesh, WINDOW_COLOUR if facade < 0 else FACADES[facade], "building"))
         at = (float(middle[0]), float(middle[1]), 0.0)
         bodies = {
@@ -111,19 +112,18 @@ class BulletScene:
             for mesh, colour, label in parts
             if len(mesh)
         }
-        posts = props.posts_in(self._ground.street_map, key)
         for post in posts:
             bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
-        furniture = self._ground.props(key)
-        xy = np.array([(prop.x_m, prop.y_m) for prop, _ in furniture]).reshape(-1, 2)
-        return _TileBodies(bodies, posts, furniture, xy, np.array([KINDS[prop.kind].seen_m for prop, _ in furniture]))
+        xy = np.array([(prop.x_m, prop.y_m) for prop, _ in chunk.props]).reshape(-1, 2)
+        seen_m = np.array([KINDS[prop.kind].seen_m for prop, _ in chunk.props])
+        return _TileBodies(bodies, posts, chunk.props, xy, seen_m)
 
     def _foot(self, post: props.SignalPost) -> tuple[float, float, float]:
-        return post.x_m, post.y_m, float(self._ground.heights([[post.x_m, post.y_m]])[0])
+        return post.x_m, post.y_m, float(self._surface.heights([[post.x_m, post.y_m]])[0])
 
     def _show_people(self, view: View, who: People, time_s: float) -> None:
         who = who.only(view.rows(who.xy, PERSON_MARGIN_M))
-        parts = placed_parts(who, self._ground.heights(who.xy), time_s)
+        parts = placed_parts(who, self._surface.heights(who.xy), time_s)
         for rigs in self._walkers.values():
             rigs.start()
         for name, at, turn in zip(who.ids, parts.at_m.tolist(), parts.turn.tolist(), strict=True):
@@ -140,7 +140,7 @@ class BulletScene:
         for rigs in self._vehicles.values():
             rigs.start()
         rows = view.rows(which.xy, VEHICLE_MARGIN_M)
-        leans = self._ground.road(which.xy[rows], which.heading[rows], which.size[rows]).tolist()
+        leans = self._surface.road(which.xy[rows], which.heading[rows], which.size[rows]).tolist()
         for i, (z, roll, pitch) in zip(rows.tolist(), leans, strict=True):
             length, width = (round(float(side), 1) for side in which.size[i])
             form = vehicles.shape(which.ids[i], length), length, width

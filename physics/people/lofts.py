@@ -48,7 +48,7 @@ class Piece:
 
 
 @dataclass(frozen=True, slots=True)
-class Surface:
+class LoftedPiece:
     """A piece at one level. vertices (V, 3) m; triangles (T, 3), front counter-clockwise; weights (V, 24); fat (V,)."""
 
     vertices: Floats
@@ -57,7 +57,7 @@ class Surface:
     fat: Floats
 
 
-def lofted(piece: Piece, level: int) -> Surface:
+def lofted(piece: Piece, level: int) -> LoftedPiece:
     """A piece at a level, closed by a fan at both ends."""
     table = _chosen(_table(piece.rings), piece.rings_kept[level])
     sides = piece.sides[level]
@@ -72,7 +72,7 @@ def lofted(piece: Piece, level: int) -> Surface:
     if _volume(vertices, triangles) < 0.0:
         triangles = triangles[:, ::-1].copy()
     own = np.concatenate([np.repeat(table[:, 12:], sides, axis=0), table[[0, -1], 12:]])
-    return Surface(vertices, triangles, _shares(own), own[:, 24])
+    return LoftedPiece(vertices, triangles, _shares(own), own[:, 24])
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,9 +14,9 @@ from physics.robots import RobotModel
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
 from physics.world.bullet import p
-from physics.world.materials import friction
 from physics.world.mesh import Mesh, as_lists, join
-from physics.world.tiles import CURB_M, Tile
+from physics.world.surface import Chunk
+from physics.world.tiles import CURB_M
 
 PERSON_M: Final = 1.7
 VEHICLE_M: Final = 1.5
@@ -73,17 +73,14 @@ class Bodies:
     def close(self) -> None:
         p.disconnect(self._client)
 
-    def add_tile(
-        self, tile: Tile, buildings: Sequence[Building], props: Sequence[tuple[Prop, float]] = ()
-    ) -> list[int]:
-        """The ground of a tile, its buildings, and its props with the heights of their feet in metres; returns what
-        `remove` takes."""
+    def add_chunk(self, chunk: Chunk) -> list[int]:
+        """What is in a square of a surface; returns what `remove` takes."""
         of_friction: dict[float, list[Mesh]] = {}
-        for name, mesh in tile.parts.items():
-            of_friction.setdefault(friction(name), []).append(mesh)
+        for patch in chunk.ground:
+            of_friction.setdefault(patch.friction, []).append(patch.mesh)
         ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
-        houses = [body for b in buildings for body in self._add_building(b)]
-        return [*ground, *houses, *(self._add_prop(prop, z) for prop, z in props)]
+        houses = [body for b in chunk.buildings for body in self._add_building(b)]
+        return [*ground, *houses, *(self._add_prop(prop, z) for prop, z in chunk.props)]
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)

@@ -15,13 +15,12 @@ import numpy as np
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, write_protected
-from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import Barrier
 from physics.robots import robot as robot_model
 from physics.world.bodies import Bodies
 from physics.world.drive import SkidDrive
-from physics.world.ground import Ground
 from physics.world.movers import Movers
+from physics.world.surface import Surface
 from physics.world.tiles import Key, distance_to, keys_within
 
 SUBSTEP_S: Final = 0.005
@@ -36,18 +35,16 @@ Kind = Literal["pedestrian", "vehicle", "wall", "object"]
 class BulletWorld:
     """The physics of one episode. Use it in a `with` block; one PyBullet client each, so several may live at once.
 
-    barriers: fences that stand for the whole episode. roughness: of the ground, from 0 (flat) to 1.
+    surface: what it stands on. barriers: fences that stand for the whole episode.
     """
 
     def __init__(
         self,
-        street_map: StreetMap,
-        seed: int,
+        surface: Surface,
         barriers: Sequence[Barrier] = (),
         robot: str = "courier",
-        roughness: float = 0.0,
     ) -> None:
-        self.ground = Ground(street_map, seed, roughness)
+        self.surface = surface
         self.model = robot_model(robot)
         self.barriers = tuple(barriers)
         self._drive = SkidDrive(self.model)
@@ -64,7 +61,7 @@ class BulletWorld:
             self._bodies = Bodies(self.model, SUBSTEP_S)
             for barrier in self.barriers:
                 size = (barrier.thickness_m, barrier.length_m)
-                z = self.ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
+                z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
                 self._bodies.add_barrier(barrier, z)
         return self
 
@@ -82,14 +79,14 @@ class BulletWorld:
 
     def height_at(self, x_m: float, y_m: float) -> float:
         """Height of the ground at a point, in metres."""
-        return float(self.ground.heights([[x_m, y_m]])[0])
+        return float(self.surface.heights([[x_m, y_m]])[0])
 
     def place(self, pose: Pose) -> RobotState:
         """Put the robot at rest at a pose, its wheels on the ground."""
         bodies = self._engine
         self._stream(pose.x_m, pose.y_m)
         self._drive.reset()
-        z, roll, pitch = self.ground.lean(pose, self.model)
+        z, roll, pitch = self.surface.lean(pose, self.model)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
 
@@ -107,9 +104,9 @@ class BulletWorld:
         car_half = half[[row[name] for name in cars.ids]] if len(cars) else np.zeros((0, 2))
 
         people_poses, car_poses = people.poses(substeps), cars.poses(substeps)
-        people_z = self.ground.heights(people_poses[-1, :, :2]) if len(people) else np.zeros(0)
+        people_z = self.surface.heights(people_poses[-1, :, :2]) if len(people) else np.zeros(0)
         bodies.show("pedestrian", people.ids, people_z)
-        cars_z = self.ground.road(car_poses[-1, :, :2], car_poses[-1, :, 2], 2.0 * car_half)[:, 0]
+        cars_z = self.surface.road(car_poses[-1, :, :2], car_poses[-1, :, 2], 2.0 * car_half)[:, 0]
         bodies.show("vehicle", cars.ids, cars_z, 2.0 * car_half)
 
         trace = np.empty((substeps, 3))
@@ -153,8 +150,7 @@ class BulletWorld:
             bodies.remove(self._tiles.pop(key))
         for key in keys_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
-                tile = self.ground.tile(key)
-                self._tiles[key] = bodies.add_tile(tile, self.ground.buildings(key), self.ground.props(key))
+                self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
 
     @property
     def _engine(self) -> Bodies:

@@ -95,10 +95,11 @@ def camera_city(size_m: float) -> StreetMap:
 def whole_frame(camera: CameraName, persons: int, frames: int, size_m: float) -> float:
     """Median seconds of a whole picture by `gl`, `bullet` or `bullet-egl`: arranged, drawn and read back."""
     from physics.cameras.choice import camera_of
+    from physics.world.street_surface import StreetSurface
     from scenarios.execution.wiring import world_of
 
     street_map = camera_city(size_m)
-    world = world_of(street_map, 5)
+    world = world_of(StreetSurface(street_map, 5))
     busy = busy_street(street_map, persons, frames)
     with camera_of(camera, world, CameraSpec(*SIZE, fov_deg=60.0)) as eyes:
         return _median(lambda street: eyes.render(busy.robot, street), busy.streets)
@@ -122,10 +123,11 @@ def people_alone(persons: int, frames: int, size_m: float) -> float:
 def together(environments: int, frames: int, size_m: float) -> float:
     """Median seconds of one environment's picture where several are drawn into one atlas and read back at once."""
     from physics.cameras.gl.atlas import Atlas
+    from physics.world.street_surface import StreetSurface
     from scenarios.execution.wiring import world_of
 
     street_map = camera_city(size_m)
-    world = world_of(street_map, 5)
+    world = world_of(StreetSurface(street_map, 5))
     busy = busy_street(street_map, PERSONS, frames)
     spec = CameraSpec(*SIZE, fov_deg=60.0)
     with Atlas([world] * environments, spec) as eyes:

@@ -29,7 +29,7 @@ from cosim.policies.route import Route
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.street.furniture import footprints
-from physics.world.ground import Ground
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import key_at
 from scenarios.bench.crowd_tally import Tally
 from scenarios.bench.group_tally import widest_gaps
@@ -155,7 +155,7 @@ def _drive(
 def things_along(scenario: Scenario, street_map: StreetMap) -> list[tuple[str, Polygon]]:
     """What stands around a route: kinds and outlines of props and buildings."""
     around = shapely.buffer(LineString(scenario.route), THINGS_M)
-    ground = Ground(street_map, scenario.place.seed)
+    ground = StreetSurface(street_map, scenario.place.seed)
     props = ground.standing(around)
     things = [(prop.kind, polygon) for prop, polygon in zip(props, footprints(props), strict=True)]
     x0, y0, x1, y1 = around.bounds

@@ -22,6 +22,8 @@ from cosim.spec.scenario import Barrier, Scenario
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.robots import robot
 from physics.street.furniture import Prop, footprints
+from physics.world.street_surface import StreetSurface
+from physics.world.surface import Surface
 from physics.world.world import BulletWorld
 from scenarios.builders.barriers import fenced
 from scenarios.execution.directing import director_of
@@ -68,9 +70,8 @@ def staged(
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     walkable = street_map.walkable_near(around)
     with ExitStack() as stack:
-        place_seed, unevenness = scenario.place.seed, scenario.place.unevenness
-        world = world_of(street_map, place_seed, scenario.barriers, scenario.robot, unevenness)
-        stack.enter_context(world)
+        street = StreetSurface(street_map, scenario.place.seed, scenario.place.unevenness)
+        world = stack.enter_context(world_of(street, scenario.barriers, scenario.robot))
         crowd = stack.enter_context(crowd_of(scenario))
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
@@ -80,9 +81,9 @@ def staged(
         if manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
         director = stack.enter_context(director_of(scenario.id, options.director, waiting))
-        director = among_residents(director, scenario, street_map, world.ground, lambda: crowd.street.people)
+        director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
-        footing = clear_of(fenced(walkable, scenario.barriers), world.ground.standing(around))
+        footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
         free = shapely.buffer(footing, -world.footprint_m[1] / 2)
         shapely.prepare(free)
         yield StagedScenario(
@@ -97,15 +98,9 @@ def staged(
         )
 
 
-def world_of(
-    street_map: StreetMap,
-    seed: int,
-    barriers: Sequence[Barrier] = (),
-    robot: str = "courier",
-    roughness: float = 0.0,
-) -> BulletWorld:
-    """The physics of a place, not running yet."""
-    return BulletWorld(street_map, seed, barriers, robot, roughness)
+def world_of(surface: Surface, barriers: Sequence[Barrier] = (), robot: str = "courier") -> BulletWorld:
+    """The physics of a surface, not running yet."""
+    return BulletWorld(surface, barriers, robot)
 
 
 def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd:

@@ -21,7 +21,7 @@ from cosim.people.steering import STEERING_NEAR_M, Neighbour
 from cosim.place.street_map import StreetMap
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Scenario
-from physics.world.ground import Ground
+from physics.world.street_surface import StreetSurface
 from scenarios.events.sight import SHARED, STILL_MPS
 from scenarios.residents.graph import BehaviorGraph, behavior_graph
 from scenarios.residents.resident import (
@@ -54,7 +54,7 @@ _KIND: Final = 0x8E51
 
 
 def among_residents(
-    director: Director, scenario: Scenario, street_map: StreetMap, ground: Ground, people: Callable[[], People]
+    director: Director, scenario: Scenario, street_map: StreetMap, ground: StreetSurface, people: Callable[[], People]
 ) -> Director:
     """A director with the scenario's residents around it; itself where there are none."""
     count = scenario.crowd.residents

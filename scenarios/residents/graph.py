@@ -28,7 +28,7 @@ from cosim.spec.scenario import Barrier
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import InteractionSpot, What, spots
 from physics.street.placement import CLEAR_HALF_M
-from physics.world.ground import Ground
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import key_at
 from scenarios.builders.barriers import outline
 
@@ -128,7 +128,7 @@ class BehaviorGraph:
 
 
 def behavior_graph(
-    street_map: StreetMap, ground: Ground, route: Sequence[tuple[float, float]], barriers: Sequence[Barrier] = ()
+    street_map: StreetMap, ground: StreetSurface, route: Sequence[tuple[float, float]], barriers: Sequence[Barrier] = ()
 ) -> BehaviorGraph:
     """The graph of the streets around a route."""
     area = shapely.buffer(LineString(route), _REACH_M)

@@ -25,6 +25,7 @@ from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, footprints, parts_of, solids_of
 from physics.street.placement import CLEAR_HALF_M, PROP_END_GAP_M, Placement, clear_half_m, street_style
 from physics.world.materials import MATERIALS, PAVINGS, Paving, friction, street_of
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.world.world import BulletWorld
 from sumo_nets.city.store import city_net
@@ -239,7 +240,7 @@ def test_a_prop_stops_the_robot_and_is_named() -> None:
     placement, _ = placed(MAP, 1)
     chosen = {prop.kind: prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip)}
     assert len(chosen) > 8
-    with BulletWorld(MAP, seed=1) as world:
+    with BulletWorld(StreetSurface(MAP, seed=1)) as world:
         for prop in chosen.values():
             y = MAP.strips[prop.id.split(":")[1]].line[0, 1]
             toward = math.copysign(math.pi / 2, prop.y_m - y)
@@ -255,7 +256,7 @@ def test_a_prop_is_seen_where_it_stands() -> None:
     """A prop ahead is in the middle of the picture with its label, its foot on its zone's ground, at its distance."""
     placement, _ = placed(MAP, 1)
     props = [prop for strip in sidewalks(MAP) for prop in placement.on_strip(strip) if prop.kind in ("bin", "planter")]
-    with BulletCamera(BulletWorld(MAP, seed=1), CameraSpec(96, 96), depth=True) as camera:
+    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), CameraSpec(96, 96), depth=True) as camera:
         for prop in props[:4]:
             y = float(MAP.strips[prop.id.split(":")[1]].line[0, 1])
             toward = math.copysign(math.pi / 2, prop.y_m - y)
@@ -364,7 +365,7 @@ def test_the_robot_feels_rough_ground() -> None:
     """On rough pavement it gets along, tilted by a few degrees at most; on flat ground it hardly tilts."""
     tilts = {}
     for roughness in (0.0, 1.0):
-        with BulletWorld(MAP, seed=3, roughness=roughness) as world:
+        with BulletWorld(StreetSurface(MAP, seed=3, roughness=roughness)) as world:
             world.place(Pose(8.0, 5.0, 0.0))
             robots = [world.step(Command(1.0, 0.0), EMPTY, EMPTY, 10).robot for _ in range(300)]
         assert robots[-1].pose.x_m > 20.0
@@ -375,4 +376,4 @@ def test_the_robot_feels_rough_ground() -> None:
 def test_roughness_has_a_range() -> None:
     """A roughness beyond 1 is refused with the range."""
     with pytest.raises(UsageError, match=r"roughness is 1\.5, but it lies between 0 \(flat\) and 1"):
-        BulletWorld(MAP, seed=1, roughness=1.5)
+        BulletWorld(StreetSurface(MAP, seed=1, roughness=1.5))

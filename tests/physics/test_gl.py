@@ -18,6 +18,7 @@ from cosim.spec.scenario import Barrier, City, Light
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
+from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from scenarios.execution.places import place
 
@@ -66,7 +67,7 @@ def test_both_cameras_see_the_same(city: City) -> None:
     crossing = next(s for s in strips if s.kind == "crossing")
     x, y = crossing.line[0]
     fence = Barrier(x_m=float(x), y_m=float(y), heading_rad=0.3, length_m=2.0, strip=crossing.id, end=0)
-    world = BulletWorld(street_map, city.seed, [fence])
+    world = BulletWorld(StreetSurface(street_map, city.seed), [fence])
     agree, depths, strip = [], [], crossing
     with GlCamera(world, SPEC, depth=True) as one, BulletCamera(world, SPEC, depth=True) as other:
         for i in range(25):
@@ -87,13 +88,13 @@ def test_both_cameras_see_the_same(city: City) -> None:
 @pytest.fixture(scope="module")
 def world() -> BulletWorld:
     _, street_map = place(CITIES[0])
-    return BulletWorld(street_map, 1)
+    return BulletWorld(StreetSurface(street_map, 1))
 
 
 def moment(world: BulletWorld, n: int = 0) -> tuple[RobotState, Street]:
-    strips = [s for s in world.ground.street_map.strips.values() if s.kind == "sidewalk" and s.length_m > 20.0]
+    strips = [s for s in place(CITIES[0])[1].strips.values() if s.kind == "sidewalk" and s.length_m > 20.0]
     robot = stand_at(world, strips[n % len(strips)], 0.5, 0.4 * n)
-    return robot, street_at(world.ground.street_map, robot.pose.xy, np.random.default_rng(n))
+    return robot, street_at(place(CITIES[0])[1], robot.pose.xy, np.random.default_rng(n))
 
 
 def same(one: Frame, other: Frame) -> bool:

@@ -8,6 +8,7 @@ import pytest
 from cosim.core.errors import EngineError, UsageError
 from cosim.episode.ports import CameraSpec
 from physics.cameras.gl import context
+from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from scenarios.bench.cameras import busy_street, camera_city
 
@@ -26,7 +27,7 @@ def test_an_atlas_holds_the_pictures_of_its_cameras() -> None:
     from physics.cameras.gl.camera import GlCamera
 
     street_map = camera_city(300.0)
-    worlds = [BulletWorld(street_map, seed, (), "courier") for seed in (1, 2, 3)]
+    worlds = [BulletWorld(StreetSurface(street_map, seed)) for seed in (1, 2, 3)]
     busy = busy_street(street_map, 8, 5)
     ticks = [[busy.streets[i + k] for k in range(3)] for i in range(2)]
     single = []
@@ -70,6 +71,6 @@ def test_an_atlas_too_large_is_refused_with_the_limit() -> None:
     """More rows than a texture may have."""
     from physics.cameras.gl.atlas import Atlas
 
-    world = BulletWorld(camera_city(300.0), 1, (), "courier")
+    world = BulletWorld(StreetSurface(camera_city(300.0), 1))
     with pytest.raises(UsageError, match="1 to 16 fit"):
         Atlas([world] * 17, CameraSpec(64, 1024))

@@ -18,6 +18,7 @@ from cosim.place.street_map import StreetMap
 from cosim.policies.route import Route
 from cosim.spec.scenario import CrowdSpec
 from physics.cameras.bullet_camera import BulletCamera
+from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from scenarios.builders.sample import suite_on_map
 from scenarios.execution.run import run_episode
@@ -66,7 +67,7 @@ def hill(tmp_path_factory: pytest.TempPathFactory) -> StreetMap:
 
 @pytest.fixture(scope="module")
 def world(hill: StreetMap) -> Iterator[BulletWorld]:
-    with BulletWorld(hill, seed=2) as world:
+    with BulletWorld(StreetSurface(hill, seed=2)) as world:
         yield world
 
 

@@ -16,6 +16,7 @@ from cosim.episode.ports import CameraSpec
 from cosim.spec.scenario import Barrier
 from physics.cameras.bullet_camera import BulletCamera
 from physics.robots import ROBOTS, robot
+from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from tests.tiny_street import tiny_map
 
@@ -28,7 +29,7 @@ OPEN = Pose(-40.0, 100.0, 0.0)
 
 @pytest.fixture
 def world() -> Iterator[BulletWorld]:
-    with BulletWorld(MAP, seed=1) as world:
+    with BulletWorld(StreetSurface(MAP, seed=1)) as world:
         yield world
 
 
@@ -137,7 +138,7 @@ def test_a_vehicle_is_named(world: BulletWorld) -> None:
 def test_a_barrier_is_an_object() -> None:
     """A fence across the sidewalk stops the robot and is named by the port it closes."""
     fence = Barrier(x_m=-17.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="nw", end=1)
-    with BulletWorld(MAP, seed=1, barriers=[fence]) as world:
+    with BulletWorld(StreetSurface(MAP, seed=1), [fence]) as world:
         world.place(Pose(-20.0, 5.0, 0.0))
         motions = drive(world, 1.0, 0.0, 80)
     assert {(c.kind, c.other) for m in motions for c in m.contacts} == {("object", "barrier:nw:1")}
@@ -158,7 +159,7 @@ def test_the_same_commands_give_the_same_trace() -> None:
     """Two fresh worlds agree bit for bit, with a turn, a ramp and a person in the way."""
 
     def traces() -> list[bytes]:
-        with BulletWorld(MAP, seed=3) as world:
+        with BulletWorld(StreetSurface(MAP, seed=3)) as world:
             world.place(Pose(0.0, -1.0, math.pi / 2))
             motions = [*drive(world, 1.2, 0.1, 80), *drive(world, 1.0, -0.5, 80, person(1.0, 6.0))]
             return [m.trace.tobytes() for m in motions]
@@ -169,7 +170,7 @@ def test_the_same_commands_give_the_same_trace() -> None:
 @pytest.mark.engine
 def test_a_world_outside_its_with_block_says_so() -> None:
     """Before and after the block nothing runs, closing twice is fine, and the message names the remedy."""
-    world = BulletWorld(MAP, seed=1)
+    world = BulletWorld(StreetSurface(MAP, seed=1))
     with pytest.raises(EngineError, match="'with' block"):
         world.place(OPEN)
     with world:
@@ -198,7 +199,7 @@ def seen(frame: Frame, name: str) -> np.ndarray:
 @pytest.mark.engine
 def test_the_camera_sees_the_street() -> None:
     """From the sidewalk: sky above, sidewalk below, and the person ahead in the middle, the feet on the ground."""
-    world = BulletWorld(MAP, seed=1)
+    world = BulletWorld(StreetSurface(MAP, seed=1))
     with BulletCamera(world, SPEC, depth=True) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
         frame = camera.render(robot, person(-15.0, 5.0, math.pi))
@@ -216,7 +217,7 @@ def test_the_camera_sees_the_street() -> None:
 @pytest.mark.engine
 def test_a_moved_person_is_drawn_where_the_snapshot_says() -> None:
     """A person to the left is left in the picture, one to the right is right, and one behind is not in it."""
-    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         robot = RobotState(Pose(-20.0, 5.0, 0.0), z_m=0.12)
         assert seen(camera.render(robot, person(-15.0, 6.0)), "person")[:, 1].mean() < 40.0
         assert seen(camera.render(robot, person(-15.0, 4.0)), "person")[:, 1].mean() > 56.0
@@ -228,12 +229,12 @@ def test_a_picture_depends_on_its_moment_alone() -> None:
     """The same state is the same picture, whatever was drawn before and in whatever camera."""
     robot = RobotState(Pose(-4.0, 5.0, 0.3), z_m=0.12)
     street = person(-1.0, 5.5, math.pi)
-    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         first = camera.render(robot, street)
         camera.render(RobotState(Pose(60.0, -6.0, 1.0), z_m=0.12), person(62.0, -6.0))
         camera.picture((0.0, 0.0, 5.0), (5.0, 5.0, 0.0), street, robot, size=(64, 48))
         again = camera.render(robot, street)
-    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as other:
+    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as other:
         fresh = other.render(robot, street)
     for frame in (again, fresh):
         assert np.array_equal(frame.rgb, first.rgb)
@@ -250,7 +251,7 @@ def test_everything_has_its_label() -> None:
     people = person(-8.0, 5.0).people
     robot = RobotState(Pose(-10.0, 5.0, 0.0), z_m=0.12)
     lit = {}
-    with BulletCamera(BulletWorld(street_map, seed=1, barriers=[fence]), SPEC) as camera:
+    with BulletCamera(BulletWorld(StreetSurface(street_map, seed=1), [fence]), SPEC) as camera:
         for walk in (True, False):
             street = Street(0, people, vehicles, {":c0": Signal(walk)})
             frame = camera.picture((-16.0, 1.0, 5.0), (0.0, 1.0, 0.0), street, robot, size=(320, 240))
@@ -265,7 +266,7 @@ def test_everything_has_its_label() -> None:
 def test_the_camera_leans_with_the_ramp() -> None:
     """Facing up a ramp a person's head is lower in the picture by the slope's angle."""
     heads = []
-    with BulletCamera(BulletWorld(MAP, seed=1), SPEC) as camera:
+    with BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC) as camera:
         for y, z in ((-1.0, 0.0), (4.22, 0.06)):
             robot = RobotState(Pose(0.0, y, math.pi / 2), z_m=z)
             heads.append(seen(camera.render(robot, person(0.0, y + 6.0)), "person")[:, 0].min())
@@ -275,7 +276,7 @@ def test_the_camera_leans_with_the_ramp() -> None:
 @pytest.mark.engine
 def test_a_camera_outside_its_with_block_says_so() -> None:
     """The message names the remedy, and closing twice is fine."""
-    camera = BulletCamera(BulletWorld(MAP, seed=1), SPEC)
+    camera = BulletCamera(BulletWorld(StreetSurface(MAP, seed=1)), SPEC)
     with pytest.raises(EngineError, match="'with' block"):
         camera.render(RobotState(OPEN), EMPTY)
     with camera:

@@ -22,6 +22,7 @@ from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip, WalkableArea
 from cosim.policies.route import Route
 from cosim.spec.scenario import City
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
 from physics.world.world import BulletWorld
 from sumo_nets.city.store import city_net
@@ -94,7 +95,7 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
 def test_route_climbs_every_ramp(place: StreetMap) -> None:
     """Driven by `route` from crossings onto corners and sidewalks: it arrives, and never stands still for a second."""
     done = 0
-    with BulletWorld(place, seed=3) as world:
+    with BulletWorld(StreetSurface(place, seed=3)) as world:
         for name, line in climbs(place, CLIMBS_PER_CITY, np.random.default_rng(5)):
             went = climb(world, line)
             assert went.left_m < 0.5 and went.slowest_m > 0.05, (name, went)
@@ -141,7 +142,7 @@ def curbs(place: StreetMap, count: int, rng: np.random.Generator) -> Iterator[tu
 def test_the_robot_does_not_climb_curbs_and_never_leaves_unnoticed(place: StreetMap) -> None:
     """At full speed at a curb it stays below; driven off a curb it is out of the walkable area before it falls."""
     street = Street(0)
-    with BulletWorld(place, seed=3) as world:
+    with BulletWorld(StreetSurface(place, seed=3)) as world:
         for strip, on_walk, on_road in curbs(place, CURBS_PER_CITY, np.random.default_rng(6)):
             area = WalkableArea(place.walkable_near(strip.polygon.buffer(10.0)))
             world.place(on_road)

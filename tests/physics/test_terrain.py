@@ -15,7 +15,7 @@ from cosim.core.geometry import Pose
 from cosim.place.street_map import Corner, Port
 from cosim.place.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
 from physics.robots import robot
-from physics.world.ground import Ground
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
 from sumo_nets.net.elevation import steep_ports, steep_strips, surveyed
 from sumo_nets.net.profile import Course, Meeting, On, clamped, course, what_lies_there
@@ -247,7 +247,7 @@ def test_ramps_rise_one_in_twelve_over_the_land() -> None:
 
 def test_nothing_floats_on_a_hill() -> None:
     """Houses reach down to the lowest land around them, props to the lowest under them; doors are at the street."""
-    ground, terrain = Ground(HILLY, 4), HILLY.terrain
+    ground, terrain = StreetSurface(HILLY, 4), HILLY.terrain
     assert terrain is not None
     houses = [b for key in KEYS for b in ground.buildings(key)]
     assert len(houses) > 5
@@ -292,9 +292,9 @@ def test_corners_too_steep_to_cross_are_closed() -> None:
 
 def test_flat_ground_is_what_it_was() -> None:
     """Without terrain a tile is at height 0; a land of height 0 gives the same heights and leans."""
-    flat = Ground(tiny_map(), 4)
+    flat = StreetSurface(tiny_map(), 4)
     zero = Terrain(-200.0, -200.0, 2.0, np.zeros((200, 200), dtype=np.float32))
-    level = Ground(dataclasses.replace(tiny_map(), terrain=zero), 4)
+    level = StreetSurface(dataclasses.replace(tiny_map(), terrain=zero), 4)
     points = np.random.default_rng(2).uniform(-40.0, 40.0, (300, 2))
     assert flat.heights(points).tolist() == level.heights(points).tolist()
     pose = Pose(0.5, 4.0, 0.7)

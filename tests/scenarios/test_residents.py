@@ -28,7 +28,7 @@ from physics.people.poses import poses
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import spots
 from physics.street.placement import CLEAR_HALF_M
-from physics.world.ground import Ground
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import key_at
 from scenarios.builders.barriers import outline
 from scenarios.catalog import load_suite, with_crowd
@@ -67,7 +67,7 @@ def town(seed: int, style: str = "mixed") -> Town:
     line = Polyline(longest.line[:, :2])
     x, y, heading = line.at(0.5 * line.length_m)
     fence = Barrier(x_m=x, y_m=y, heading_rad=heading, length_m=longest.width_m + 0.3, strip=longest.id, end=0)
-    ground = Ground(street_map, seed)
+    ground = StreetSurface(street_map, seed)
     route = tuple((float(px), float(py)) for px, py in line.points)
     graph = behavior_graph(street_map, ground, route, (fence,))
     around = LineString(route).buffer(80.0)
@@ -204,7 +204,7 @@ def test_where_no_shelter_stands_nobody_waits_for_a_bus() -> None:
     """What there is to do comes from what stands there: no props and no houses, nothing to do."""
     one = town(*CITIES[0])
     assert list(spots(one.map, (), ())) == []
-    ground = Ground(one.map, CITIES[0][0])
+    ground = StreetSurface(one.map, CITIES[0][0])
     shelters = {p.id for p in ground.standing(LineString(one.route).buffer(90.0)) if p.kind == "shelter"}
     assert {s.thing.rpartition("/")[0] for s in one.graph.spots if s.what == "stop"} <= shelters
 

@@ -26,6 +26,7 @@ from physics.street.clearance import clear_width
 from physics.street.furniture import KINDS, footprints
 from physics.street.mapped import HOUSES_M, MAPPED_NEAR_M, MappedThings
 from physics.street.placement import props_of
+from physics.world.street_surface import StreetSurface
 from physics.world.tiles import TILE_M, keys_within
 from physics.world.world import BulletWorld
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
@@ -247,7 +248,7 @@ def test_a_house_is_cut_by_tiles_and_loses_nothing() -> None:
 def test_the_robot_stops_at_a_mapped_wall() -> None:
     """Driven at a wall that runs aslant the robot touches it as a wall and does not pass."""
     place = lone_map(house((0, 3), (14, 12), (0, 20), (-14, 12)))
-    with BulletWorld(place, seed=1) as world:
+    with BulletWorld(StreetSurface(place, seed=1)) as world:
         world.place(Pose(3.0, -0.5, math.pi / 2))
         motions = [world.step(Command(1.0, 0.0), Street(0), Street(0), 10) for _ in range(160)]
     assert {(c.kind, c.other.split(":")[1]) for m in motions for c in m.contacts} == {("wall", "map")}

@@ -40,7 +40,7 @@ class GlCamera(WorldCamera):
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool = False, light: Light = NOON) -> None:
         super().__init__(world, spec, depth)
-        self._sky = sky_of(light, world.ground.seed)
+        self._sky = sky_of(light, world.surface.seed)
         self._light = lighting_of(self._sky)
         self._lights: dict[tuple[int, int], Lighting] = {}
         self._context: moderngl.Context | None = None
@@ -52,7 +52,7 @@ class GlCamera(WorldCamera):
         if self._context is None:
             world, shadows = self._world, self._light.shadows
             with context() as gl:
-                self._scene = GlScene(gl, world.ground, world.barriers, world.model, self._light)
+                self._scene = GlScene(gl, world.surface, world.barriers, world.model, self._light)
                 self._shadows = ShadowMaps(gl) if shadows else None
                 self._block, self._sun_block = SceneBlock(gl), SceneBlock(gl)
                 self._backdrop = Backdrop(gl, self._sky)

@@ -24,14 +24,14 @@ from physics.cameras.gl.robot_body import robot_parts
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import SHADOW_REACH_M, STEP_M, middle_of
 from physics.cameras.gl.surfaces import surfaces
-from physics.cameras.gl.tiles import TileBuffers, ground_parts, paint_parts, tile_shaders
+from physics.cameras.gl.tiles import TileBuffers, tile_shaders
 from physics.cameras.gl.walls import WallBuffers, wall_shaders
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
 from physics.robots import RobotModel
 from physics.street import props, vehicles
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
-from physics.world.ground import Ground
+from physics.world.surface import Patch, Surface
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
 
 CAST_M: Final = 18.0
@@ -51,7 +51,7 @@ class _Tile:
     thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
 
     middle: Floats
-    ground: TileBuffers
+    ground: TileBuffers | None
     paint: TileBuffers | None
     walls: WallBuffers
     things: _Placed
@@ -61,9 +61,9 @@ class _Tile:
     post_z: Floats
 
     def release(self) -> None:
-        self.ground.release()
-        if self.paint is not None:
-            self.paint.release()
+        for laid_out in (self.ground, self.paint):
+            if laid_out is not None:
+                laid_out.release()
         self.walls.release()
 
 
@@ -71,9 +71,14 @@ class GlScene:
     """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
 
     def __init__(
-        self, context: moderngl.Context, ground: Ground, barriers: Sequence[Barrier], model: RobotModel, light: Lighting
+        self,
+        context: moderngl.Context,
+        surface: Surface,
+        barriers: Sequence[Barrier],
+        model: RobotModel,
+        light: Lighting,
     ) -> None:
-        self._context, self._ground, self._model = context, ground, model
+        self._context, self._surface, self._model = context, surface, model
         self._tiles: dict[Key, _Tile] = {}
         self._shadows = shadows = light.shadows
         self._surfaces = surfaces(context)
@@ -125,7 +130,7 @@ class GlScene:
         casts = _near(xy, shot.eye_m, CAST_M)
         rows = (seen | casts if self._shadows else seen).nonzero()[0]
         who = street.people.only(rows)
-        z = self._ground.heights(who.xy)
+        z = self._surface.heights(who.xy)
         self._crowd.set(who, _CLOCK.time_s(street.tick), z, shot, self._anchor, seen[rows], casts[rows])
 
     def _stand(self, middle: Floats) -> None:
@@ -148,7 +153,8 @@ class GlScene:
         if stage != "moving":
             for tile in self._in_view if stage == "colour" else self._shading:
                 tile.walls.draw(stage, self._anchor)
-                tile.ground.draw(stage, self._anchor)
+                if tile.ground is not None:
+                    tile.ground.draw(stage, self._anchor)
 
     def draw_paint(self) -> None:
         """Draw what lies on the ground; to be drawn after it, without labels and depth."""
@@ -181,17 +187,13 @@ class GlScene:
     def _built(self, key: Key) -> _Tile:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
-        tile = self._ground.tile(key)
-        ground = TileBuffers(self._context, self._shaders, ground_parts(self._ground, tile), middle)
-        lines = paint_parts(self._ground.street_map, tile)
-        painted = TileBuffers(self._context, self._shaders, lines, middle) if lines else None
-        walls = WallBuffers(
-            self._context, self._wall_shaders, self._ground.buildings(key), self._ground.street_map, middle
-        )
-        posts = props.posts_in(self._ground.street_map, key)
+        chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
+        ground = self._laid_out((*finish.laid, *chunk.ground), middle)
+        painted = self._laid_out(finish.painted, middle)
+        walls = WallBuffers(self._context, self._wall_shaders, chunk.buildings, finish.styles, middle)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
-        post_z = self._ground.heights(post_xy)
-        furniture = self._ground.props(key)
+        post_z = self._surface.heights(post_xy)
+        furniture = chunk.props
         form = [self._prop_form(prop) for prop, _ in furniture]
         xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
@@ -203,6 +205,9 @@ class GlScene:
         seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
         return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
+
+    def _laid_out(self, patches: Sequence[Patch], middle: Floats) -> TileBuffers | None:
+        return TileBuffers(self._context, self._shaders, patches, middle) if patches else None
 
     def _prop_form(self, prop: Prop) -> int:
         return self._forms.id(
@@ -233,7 +238,7 @@ class GlScene:
         return form[rows], here
 
     def _fence(self, barrier: Barrier) -> _Placed:
-        z = self._ground.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
+        z = self._surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
         form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.PROP_RED), Coat(white, props.PROP_WHITE)])
@@ -278,7 +283,7 @@ class GlScene:
             return _NOTHING, _NOTHING
         forms, paints = zip(*(self._vehicle_form(which.ids[i], *which.size[i].tolist()) for i in rows), strict=True)
         xy, heading, form = which.xy[rows], which.heading[rows], np.array(forms)
-        lean = self._ground.road(xy, heading, which.size[rows])
+        lean = self._surface.road(xy, heading, which.size[rows])
         placed = instances(np.column_stack([xy - self._anchor, lean[:, 0]]), heading, paints, LABELS["vehicle"])
         if lean.any():
             placed["turn"] = [_quaternion(r, p, h) for (_, r, p), h in zip(lean, heading, strict=True)]
@@ -298,7 +303,7 @@ class GlScene:
     def _robot(self, robot: RobotState) -> _Placed:
         """The robot with its base frame at its pose, leaning with the ground."""
         form = self._forms.id(("robot", self._model.name), partial(robot_parts, self._model.urdf))
-        _, roll, pitch = self._ground.lean(robot.pose, self._model)
+        _, roll, pitch = self._surface.lean(robot.pose, self._model)
         rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
         rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
         rows["turn"] = _quaternion(roll, pitch, robot.pose.heading_rad)

@@ -3,23 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import moderngl
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from cosim.place.street_map import StreetMap
 from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
-from physics.street.frontage import frontage_in
-from physics.street.paint import paint_in
-from physics.textures.ground import layer_of
-from physics.world.ground import Ground
-from physics.world.materials import PAVINGS
-from physics.world.mesh import Mesh
-from physics.world.tiles import Tile, surface
+from physics.world.surface import Patch
 
 _TINTED: Final = 128
 """Added to the label of a surface whose colour tints its texture."""
@@ -56,41 +49,17 @@ def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
-class GroundPart(NamedTuple):
-    """A mesh of one material. layer: its texture; tint: its colour, None for the texture's own."""
-
-    mesh: Mesh
-    layer: str
-    label: str
-    tint: tuple[float, float, float] | None = None
-
-
-def ground_parts(ground: Ground, tile: Tile) -> list[GroundPart]:
-    """The ground of a tile, a part for each of its surfaces; what lies over another is drawn first."""
-    laid = frontage_in(ground.street_map, tile, ground.seed, ground.mapped)
-    found = [GroundPart(mesh, cover.layer, "ground", cover.colour) for mesh, cover in laid]
-    for name, mesh in tile.parts.items():
-        label, colour = surface(name)
-        found.append(GroundPart(mesh, layer_of(name, ground.seed), label, colour if name in PAVINGS else None))
-    return found
-
-
-def paint_parts(street_map: StreetMap, tile: Tile) -> list[GroundPart]:
-    """What lies on the ground of a tile; drawn without labels."""
-    return [GroundPart(mesh, layer, "road") for layer, mesh in paint_in(street_map, tile).items()]
-
-
 class TileBuffers:
-    """Parts of the ground of one tile. middle: (2,) world metres of the tile's."""
+    """Patches of one tile, drawn in their order. middle: (2,) world metres of the tile's."""
 
     def __init__(
-        self, context: moderngl.Context, shaders: SurfaceShaders, ground: Sequence[GroundPart], middle: Floats
+        self, context: moderngl.Context, shaders: SurfaceShaders, patches: Sequence[Patch], middle: Floats
     ) -> None:
         parts = []
-        for mesh, layer, label, tint in ground:
-            here = mesh.moved((*-middle, 0.0))
-            rows = corners(here, tint or (0.0, 0.0, 0.0), LABELS[label] + (_TINTED if tint else 0))
-            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(layer)
+        for patch in patches:
+            here = patch.mesh.moved((*-middle, 0.0))
+            rows = corners(here, patch.colour, LABELS[patch.label] + (_TINTED if patch.tinted else 0))
+            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(patch.layer)
             parts.append((here, rows))
         rows, triangles = joined_corners(parts)
         self._spot = TilePlace(context, middle)

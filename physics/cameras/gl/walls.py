@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from cosim.place.street_map import StreetMap
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, Pass
 from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
 from physics.street.buildings import Building, facade_meshes
-from physics.street.fronts import NARROWEST_FRONT_M, face_of, style_of
+from physics.street.fronts import NARROWEST_FRONT_M, face_of
 from physics.textures.facade_canvas import BAY_M, STOREY_M
 from physics.textures.facades import BAY_VARIANTS, WallStyle
 from physics.world.mesh import Mesh
@@ -97,18 +96,19 @@ def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, n
 
 
 class WallBuffers:
-    """The buildings of one tile. middle: (2,) world metres of the tile's."""
+    """The buildings of one tile, each of a style. middle: (2,) world metres of the tile's."""
 
     def __init__(
         self,
         context: moderngl.Context,
         shaders: SurfaceShaders,
         buildings: Sequence[Building],
-        street_map: StreetMap,
+        styles: Sequence[WallStyle],
         middle: Floats,
     ) -> None:
         self._spot = TilePlace(context, middle)
-        parts = [rows for b in buildings for rows in _rows(b, style_of(b, street_map), shaders.surfaces, middle)]
+        styled = zip(buildings, styles, strict=True)
+        parts = [rows for b, style in styled for rows in _rows(b, style, shaders.surfaces, middle)]
         self._arrays: list[moderngl.VertexArray] = []
         self._buffers: list[moderngl.Buffer] = []
         if not parts:

@@ -1,0 +1,125 @@
+"""A street map as a surface: tiles, buildings and props by key, heights by point; built when first needed."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Final
+
+import numpy as np
+import shapely
+from numpy.typing import ArrayLike
+
+from cosim.core.errors import UsageError
+from cosim.core.geometry import Floats
+from cosim.place.street_map import StreetMap
+from physics.street.buildings import Building, Frontage, on_land
+from physics.street.frontage import frontage_in
+from physics.street.fronts import style_of
+from physics.street.furniture import Prop
+from physics.street.mapped import MappedThings
+from physics.street.paint import paint_in
+from physics.street.placement import Placement
+from physics.street.props import SignalPost, posts_in
+from physics.textures.ground import layer_of
+from physics.world.materials import PAVINGS, PLAIN_FRICTION, Paving, friction
+from physics.world.surface import Chunk, Finish, Patch, Surface
+from physics.world.tiles import Key, Tile, build_tile, cells_of, key_at, square, surface
+
+_KEPT: Final = 100
+
+
+class StreetSurface(Surface):
+    """Tiles, buildings and props of a street map under a seed; the least recently used tiles are forgotten.
+
+    roughness: of the ground, from 0 (flat) to 1.
+    """
+
+    def __init__(self, street_map: StreetMap, seed: int, roughness: float = 0.0) -> None:
+        if not 0.0 <= roughness <= 1.0:
+            raise UsageError(f"roughness is {roughness:g}, but it lies between 0 (flat) and 1")
+        self.street_map = street_map
+        self.seed = seed
+        self.roughness = roughness
+        self.level = street_map.terrain is None
+        self._mapped = mapped = MappedThings(street_map)
+        self._frontage = Frontage(street_map, seed, mapped)
+        self._paving = Paving(street_map, seed)
+        self._placement = Placement(street_map, seed, self._frontage, mapped)
+        self._tiles: OrderedDict[Key, Tile] = OrderedDict()
+
+    def chunk(self, key: Key) -> Chunk:
+        ground = [
+            Patch(name, mesh, friction(name), *surface(name), layer_of(name, self.seed), name in PAVINGS)
+            for name, mesh in self.tile(key).parts.items()
+        ]
+        return Chunk(tuple(ground), self.buildings(key), self.props(key))
+
+    def posts(self, key: Key) -> list[SignalPost]:
+        return posts_in(self.street_map, key)
+
+    def finish(self, key: Key) -> Finish:
+        tile, laid, painted = self.tile(key), [], []
+        for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed, self._mapped):
+            tint = colour or (1.0, 1.0, 1.0)
+            laid.append(Patch(f"ground:{layer}", mesh, PLAIN_FRICTION, "ground", tint, layer, colour is not None))
+        for layer, mesh in paint_in(self.street_map, tile).items():
+            label = "road" if layer == "paint" else "sidewalk"
+            painted.append(Patch(f"{label}:{layer}", mesh, PLAIN_FRICTION, label, (1.0, 1.0, 1.0), layer, False))
+        styles = [style_of(building, self.street_map) for building in self._frontage.in_tile(key)]
+        return Finish(tuple(laid), tuple(painted), tuple(styles))
+
+    def tile(self, key: Key) -> Tile:
+        if key not in self._tiles:
+            roots = self._trees(key) if self.roughness > 0.0 else []
+            self._tiles[key] = build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
+            if len(self._tiles) > _KEPT:
+                self._tiles.popitem(last=False)
+        self._tiles.move_to_end(key)
+        return self._tiles[key]
+
+    def buildings(self, key: Key) -> tuple[Building, ...]:
+        """Buildings whose centre lies in the tile, on their land."""
+        buildings, terrain = self._frontage.in_tile(key), self.street_map.terrain
+        return buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+
+    def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
+        """Props whose middle lies in the tile, each with the height of its foot in metres."""
+        props = self._placement.in_tile(key)
+        heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
+        if props and not self.level:
+            sizes = np.array([prop.size_m[:2] for prop in props])
+            heights = heights - self.fall([(p.x_m, p.y_m) for p in props], [p.heading_rad for p in props], sizes)
+        return tuple(zip(props, heights.tolist(), strict=True))
+
+    def land(self, xy: ArrayLike) -> Floats:
+        terrain = self.street_map.terrain
+        return np.zeros(len(np.asarray(xy).reshape(-1, 2))) if terrain is None else terrain.height(xy)
+
+    def standing(self, area: shapely.Geometry) -> list[Prop]:
+        """Props in the tiles that an area touches."""
+        x0, y0, x1, y1 = shapely.bounds(area).tolist()
+        (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+        squares = np.array([shapely.box(*square(key)) for key in keys], dtype=object)
+        shapely.prepare(area)
+        return [
+            prop for k in np.flatnonzero(shapely.intersects(area, squares)) for prop in self._placement.in_tile(keys[k])
+        ]
+
+    def _trees(self, key: Key) -> list[tuple[float, float]]:
+        """Where trees stand in a tile and around it."""
+        around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
+        props = [prop for near in around for prop in self._placement.in_tile(near) if prop.kind == "tree"]
+        return [(prop.x_m, prop.y_m) for prop in props]
+
+    def heights(self, xy: ArrayLike) -> Floats:
+        """Height of the ground at (N, 2) points, (N,) metres."""
+        xy = np.asarray(xy, dtype=float).reshape(-1, 2)
+        cells = cells_of(xy)
+        if len(xy) and (cells == cells[0]).all():
+            return self.tile((int(cells[0, 0]), int(cells[0, 1]))).height(xy)
+        height = np.zeros(len(xy))
+        for i, j in dict.fromkeys(map(tuple, cells.tolist())):
+            here = (cells[:, 0] == i) & (cells[:, 1] == j)
+            height[here] = self.tile((i, j)).height(xy[here])
+        return height
