@@ -20,6 +20,9 @@ def load_suite(name: str) -> Suite:
     """A shipped suite by name, or one of the user's by the path of its .json file.
 
     Raises UsageError with the valid names, SpecError naming the file and the field.
+
+    >>> load_suite("long-horizon").scenarios[0].id
+    'lh-011-00'
     """
     if name.endswith(".json"):
         return read_suite(Path(name))

@@ -32,7 +32,14 @@ MOST_LISTED = 30
 
 
 class CosimError(Exception):
-    """Root of every error this project raises on purpose. The message says what to do."""
+    """Root of every error this project raises on purpose. The message says what to do.
+
+    >>> try:
+    ...     raise unknown("suite", "long-horizont", ["long-horizon", "reactive"])
+    ... except CosimError as error:
+    ...     print(error.exit_code, error)
+    2 unknown suite 'long-horizont'. Valid choices: long-horizon, reactive.
+    """
 
     exit_code: ClassVar[int] = BROKEN_MACHINE
 

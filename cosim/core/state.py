@@ -156,7 +156,11 @@ class Street:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What the robot is told: forward speed in m/s and yaw rate in rad/s, left positive."""
+    """What the robot is told: forward speed in m/s and yaw rate in rad/s, left positive.
+
+    >>> Command(v_mps=1.0, w_radps=-0.2)
+    Command(v_mps=1.0, w_radps=-0.2)
+    """
 
     v_mps: float
     w_radps: float

@@ -25,6 +25,12 @@ class Log:
     people_tick (P,), people_xy (P, 2), people_event, people_resident (P,) bool: persons within 30 m, once a second,
     for pictures.
     event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
+
+    `Log.load` reads the trajectory.npz of a run folder and raises RunError naming the file.
+
+    >>> Log.load(Path("runs/mine/episodes/lh-011-00/trajectory.npz"))
+    Traceback (most recent call last):
+    cosim.core.errors.RunError: runs/mine/episodes/lh-011-00/trajectory.npz: not a trajectory: ...
     """
 
     tick_s: float

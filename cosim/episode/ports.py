@@ -51,7 +51,13 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """A policy's camera: size in pixels, vertical field of view in degrees, mount on the robot's base frame."""
+    """A policy's camera: size in pixels, vertical field of view in degrees.
+
+    mount_m: x ahead, y left, z up of the robot's base, which lies on the ground; pitch_down_deg: below the horizon.
+
+    >>> CameraSpec(width=512, height=288, fov_deg=60.0).width
+    512
+    """
 
     width: int = 96
     height: int = 96
@@ -82,7 +88,13 @@ class Privileged:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds."""
+    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds.
+
+    tick, time_s: since the start of the episode; privileged: only for a manifest that declares it.
+
+    >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0).privileged is None
+    True
+    """
 
     tick: int
     time_s: float
@@ -94,7 +106,14 @@ class Observation:
 
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a policy says of itself. rate_hz: how often it acts; waypoint_dt_s: time between its waypoints."""
+    """What a policy says of itself. rate_hz: how often it acts; waypoint_dt_s: time between its waypoints.
+
+    camera: what it sees by, None for a blind one; privileged: whether it is told what a camera does not show. Raises
+    nothing itself: an episode refuses what cannot be, such as a rate of which a period is no whole number of ticks.
+
+    >>> Manifest("mine", rate_hz=5.0, camera=CameraSpec(width=512, height=288)).camera.height
+    288
+    """
 
     name: str
     version: str = "1"
@@ -105,7 +124,18 @@ class Manifest:
 
 
 class Policy(Protocol):
-    """A navigation policy. One object lives through many episodes; `reset` comes before each."""
+    """A navigation policy. One object lives through many episodes; `reset` comes before each.
+
+    Whatever it raises is its own crash, recorded with the episode; it never ends the run.
+
+    >>> class Ahead:
+    ...     manifest = Manifest("ahead", camera=None)
+    ...
+    ...     def reset(self, scenario_id, seed): ...
+    ...
+    ...     def act(self, observation):
+    ...         return Command(1.0, 0.0)
+    """
 
     @property
     def manifest(self) -> Manifest: ...

@@ -29,6 +29,9 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
     """A new policy, its manifest read. Raises UsageError when the name means nothing or the class is no policy.
 
     timer: is told while the policy is loaded and whenever it is asked.
+
+    >>> load_policy("route").manifest.name
+    'route'
     """
     if ":" not in name:
         if name not in POLICIES:

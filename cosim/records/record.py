@@ -54,6 +54,12 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
+
+    `Record.load` reads the record.json of a run folder and raises RunError naming the file and the field.
+
+    >>> Record.load(Path("runs/mine/episodes/lh-011-00/record.json"))
+    Traceback (most recent call last):
+    cosim.core.errors.RunError: runs/mine/episodes/lh-011-00/record.json: ...
     """
 
     scenario: str

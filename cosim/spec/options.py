@@ -28,7 +28,11 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
     is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
     compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
-    one replays."""
+    one replays.
+
+    >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
+    'bullet'
+    """
 
     suite_hash: str = ""
     policy_source: str = ""

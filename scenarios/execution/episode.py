@@ -54,6 +54,16 @@ class Episode:
 
     Raises UsageError when it is used out of turn, PolicyError for an answer that is no command, EngineError when an
     engine fails or runs already, and what its place raises.
+
+    >>> from cosim import load_policy, load_suite
+    >>> policy = load_policy("straight")
+    >>> with Episode(load_suite("reactive").scenarios[0], policy.manifest) as episode:
+    ...     observation = episode.reset()
+    ...     while not episode.over:
+    ...         observation = episode.advance(policy.act(observation))
+    >>> record, log = episode.result()
+    >>> record.ended, len(log) == record.ticks
+    ('failure', True)
     """
 
     def __init__(

@@ -50,8 +50,8 @@ def run(
     RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
     with status "crashed".
 
-        table = cosim.run("reactive", MyPolicy(), episodes=2)
-        print(table[["scenario", "success", "route_completion"]])
+    >>> run("reactive", "straight", scenarios=["obstructing-001"])[["scenario", "success"]].to_dict("records")
+    [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
     whole = load_suite(suite) if isinstance(suite, str) else suite
     picked = scenarios_chosen(whole, scenarios, episodes, events)
