@@ -19,6 +19,7 @@ import msgspec
 from bridge.codec import decode, encode
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError
+from cosim.core.state import PersonKind
 from cosim.spec.events import EventQuery, EventReply
 
 React = Callable[[EventQuery], EventReply]
@@ -107,6 +108,8 @@ def _check(reply: EventReply, query: EventQuery) -> None:
     shown = {actor.id for actor in reply.actors}
     if len(shown) < len(reply.actors) or not shown <= known:
         raise EngineError(f"it showed people of no event, or twice: {', '.join(sorted(shown - known)[:5])}")
+    if other := [actor.id for actor in reply.actors if actor.kind != PersonKind.EVENT]:
+        raise EngineError(f"it showed people of events as others: {', '.join(other[:5])}")
     walkers = [walker for state in reply.states for walker in state.walkers]
     told = sum(abs(w.x_m) + abs(w.y_m) + abs(w.heading_rad) for w in walkers)
     told += sum(

@@ -114,3 +114,23 @@ def _public_names(module: ast.Module) -> set[str]:
             case ast.AnnAssign(target=ast.Name(id=name)):
                 names.add(name)
     return {name for name in names if not name.startswith("_")}
+
+
+_LOOKS_INTO_AN_ID = re.compile(
+    r"""startswith\((?:GUEST|"(?:[cenv]|ei-)"\))|\bids\[\w+\]\["""
+    r"""|(?:\.id|\b(?<!\.)name)\[0\] (?:in|==|!=)|bisect_\w+\([\w.]*ids"""
+)
+
+
+def test_nobody_looks_into_a_persons_id() -> None:
+    """Whose a person is, and how old, are columns of `People`: no file asks how an id begins, nor for its letters."""
+    guilty = (
+        'ids[i][0] in "en"',
+        'n.startswith("c")',
+        'b.id[0] in "en"',
+        'bisect_left(people.ids, "e")',
+        "name[0] == k",
+    )
+    assert all(map(_LOOKS_INTO_AN_ID.search, guilty))
+    texts = {path: path.read_text() for room in ROOMS for path in (ROOT / room).rglob("*.py")}
+    assert not [str(path) for path, text in texts.items() if _LOOKS_INTO_AN_ID.search(text)]

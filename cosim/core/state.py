@@ -6,9 +6,10 @@ Arrays are write-protected; positions are world metres, headings radians counter
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from enum import IntEnum
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,27 @@ PERSON_RADIUS_M = 0.3
 Doing = Literal["walk", "stand", "look", "talk", "queue", "stop", "phone", "sit"]
 """What a pedestrian's body shows: walking, standing, looking around, talking, queueing, the stopping hand, reading a
 phone, sitting on a seat behind the place where it is."""
+
+
+class PersonKind(IntEnum):
+    """Whose a person is: of the background crowd, of an event, a resident (`CrowdSpec.residents`), or injected."""
+
+    CROWD = 0
+    EVENT = 1
+    RESIDENT = 2
+    INJECTED = 3
+
+
+DIRECTED: Final = (PersonKind.EVENT, PersonKind.INJECTED)
+"""Whom the director of events moves."""
+
+
+class Age(IntEnum):
+    """How old a person looks, and in the crowd how fast it walks."""
+
+    ADULT = 0
+    CHILD = 1
+    ELDERLY = 2
 
 
 def write_protected(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] | None = None) -> NDArray[Any]:
@@ -49,12 +71,12 @@ class RobotState:
 
 @dataclass(frozen=True, slots=True)
 class People:
-    """Pedestrians of a moment. ids: N unique names, sorted; xy (N, 2) m; heading (N,) rad; speed (N,) m/s.
+    """Pedestrians of a moment. ids: N unique names; xy (N, 2) m; heading (N,) rad; speed (N,) m/s. A name says nothing
+    of who has it: kind (N,) int8 of `PersonKind`, age (N,) int8 of `Age`.
 
     strides (N,): strides taken so far, whose fraction is the phase of the gait; pace (N,) m/s: the speed that the body
     shows, which follows the speed as one starts and stops (`cosim.people.gait`). Both are for pictures: nothing else
-    reads them. Background walkers have ids that start with "c", event pedestrians with "e", residents
-    (`CrowdSpec.residents`) with "n"."""
+    reads them."""
 
     ids: tuple[str, ...]
     xy: Floats
@@ -63,6 +85,8 @@ class People:
     doing: tuple[Doing, ...]
     strides: Floats
     pace: Floats
+    kind: NDArray[np.int8]
+    age: NDArray[np.int8]
 
     @classmethod
     def of(
@@ -74,8 +98,11 @@ class People:
         doing: tuple[Doing, ...],
         strides: Any = None,
         pace: Any = None,
+        kind: Any = PersonKind.CROWD,
+        age: Any = Age.ADULT,
     ) -> People:
-        """Without strides and pace: people at the beginning of a stride, at the pace of their speed."""
+        """Without strides and pace: people at the beginning of a stride, at the pace of their speed. kind, age: of all
+        of them, or of each."""
         n = len(ids)
         return cls(
             ids,
@@ -85,19 +112,32 @@ class People:
             doing,
             write_protected(np.zeros(n) if strides is None else strides, shape=(n,)),
             write_protected(speed if pace is None else pace, shape=(n,)),
+            write_protected(np.broadcast_to(kind, n), np.int8),
+            write_protected(np.broadcast_to(age, n), np.int8),
         )
+
+    def copied(self) -> People:
+        """The same people in arrays of their own."""
+        return People.of(*(getattr(self, column.name) for column in fields(self)))
+
+    def are(self, *kinds: PersonKind) -> NDArray[np.bool_]:
+        """(N,) who is of one of these kinds."""
+        return np.isin(self.kind, kinds)
 
     def only(self, rows: NDArray[np.intp]) -> People:
         """Those in these rows."""
         if len(rows) == len(self.ids) and (rows == np.arange(len(rows))).all():
             return self
-        arrays = [array[rows] for array in (self.xy, self.heading, self.speed, self.strides, self.pace)]
-        for array in arrays:
-            array.flags.writeable = False
-        xy, heading, speed, strides, pace = arrays
         chosen = rows.tolist()
-        ids, doing = tuple([self.ids[i] for i in chosen]), tuple([self.doing[i] for i in chosen])
-        return People(ids, xy, heading, speed, doing, strides, pace)
+
+        def part(column: Any) -> Any:
+            if isinstance(column, tuple):
+                return tuple([column[i] for i in chosen])
+            taken = column[rows]
+            taken.flags.writeable = False
+            return taken
+
+        return People(*(part(getattr(self, column.name)) for column in fields(self)))
 
     def __len__(self) -> int:
         return len(self.ids)

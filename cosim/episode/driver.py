@@ -17,7 +17,7 @@ from typing import Literal, Protocol
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
-from cosim.core.state import Command, People, RobotState, Signal, Vehicles
+from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import Limits, command_of
 from cosim.episode.ports import Manifest, Observation, Policy, Privileged
 
@@ -118,14 +118,12 @@ class Driver:
         if self._route is None or self._route[0] is not known.route:
             self._route = (known.route, Polyline(known.route.points.copy()))
         robot = known.robot
-        people, vehicles = known.people, known.vehicles
+        vehicles = known.vehicles
         return Privileged(
             robot=RobotState(robot.pose, robot.v_mps, robot.w_radps, robot.z_m, robot.tilt_rad),
             route=self._route[1],
             route_s_m=known.route_s_m,
-            people=People.of(
-                people.ids, people.xy, people.heading, people.speed, people.doing, people.strides, people.pace
-            ),
+            people=known.people.copied(),
             vehicles=Vehicles.of(vehicles.ids, vehicles.xy, vehicles.heading, vehicles.speed, vehicles.size),
             signals={name: Signal(signal.walk, signal.changes_in_s) for name, signal in known.signals.items()},
             crossings=known.crossings,

@@ -22,8 +22,8 @@ class Log:
     travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
     reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
     on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.judge.traffic`.
-    people_tick (P,), people_xy (P, 2), people_event, people_resident (P,) bool: persons within 30 m, once a second,
-    for pictures.
+    people_tick (P,), people_xy (P, 2), people_kind, people_age (P,) of `PersonKind` and `Age`: persons within 30 m,
+    once a second, for pictures.
     event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
 
     `Log.load` reads the trajectory.npz of a run folder and raises RunError naming the file.
@@ -46,8 +46,8 @@ class Log:
     vehicles_braked: NDArray[np.int64]
     people_tick: NDArray[np.int64]
     people_xy: Floats
-    people_event: NDArray[np.bool_]
-    people_resident: NDArray[np.bool_]
+    people_kind: NDArray[np.int8]
+    people_age: NDArray[np.int8]
     event_tracks: Floats
 
     def __len__(self) -> int:
@@ -75,8 +75,6 @@ class Log:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 held = dict(arrays)
-                # Logs from before there were residents do not mention them.
-                held.setdefault("people_resident", np.zeros(len(held["people_event"]), dtype=bool))
                 values = {name: held[name] for name in (f.name for f in fields(cls))}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RunError(f"{path}: not a trajectory: {error}") from error

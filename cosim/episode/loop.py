@@ -89,7 +89,7 @@ def query(scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[floa
         robot_width_m=footprint_m[1],
         events=scenario.events,
         states=now.states,
-        bystanders=bystanders(now.street.people, scenario.events),
+        bystanders=bystanders(now.street.people),
     )
 
 

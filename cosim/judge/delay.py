@@ -39,13 +39,9 @@ class Delay(NamedTuple):
 
 
 class Tracks:
-    """Where everybody of one kind was, tick by tick, from when it was first seen until it was first missed.
+    """Where everybody was, tick by tick, from when it was first seen until it was first missed."""
 
-    ids that start with another letter than `kind` are left out.
-    """
-
-    def __init__(self, kind: str) -> None:
-        self._kind = kind
+    def __init__(self) -> None:
         self._tick = 0
         self._xy: dict[str, array[float]] = {}
         self.began: dict[str, int] = {}
@@ -53,8 +49,6 @@ class Tracks:
     def add(self, bodies: People | Vehicles) -> None:
         """The next tick."""
         for name, (x_m, y_m) in zip(bodies.ids, bodies.xy.tolist(), strict=True):
-            if not name.startswith(self._kind):
-                continue
             began = self.began.setdefault(name, self._tick)
             way = self._xy.setdefault(name, array("d"))
             if len(way) == 2 * (self._tick - began):

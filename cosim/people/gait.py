@@ -7,6 +7,7 @@ with the pace; so what is counted are strides, each metre in strides of the leng
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Final
@@ -16,6 +17,7 @@ from numpy.typing import ArrayLike
 
 from cosim.core.geometry import Floats
 from cosim.core.rows import RowLookup
+from cosim.core.state import Age
 
 REFERENCE_M: Final = 1.75
 """Stature of the person whose strides are listed."""
@@ -31,31 +33,22 @@ stride, step frequency, time of swing and speed of walking, Ergonomics 9(5), 196
 SETTLE_S: Final = 0.25
 """Time constant with which the shown pace follows the speed: how long a start or a stop takes."""
 
-_CHILD, _ELDER = 0.10, 0.12
 _JUMP_M: Final = 1.0
 """Who moves further in a tick was set there."""
 
 
 @lru_cache(maxsize=65536)
-def stature_m(name: str) -> float:
-    """Height of the person called `name` without shoes: always the same; people of all ages, 1.15 to 1.95 m.
+def stature_m(name: str, age: int) -> float:
+    """Height of the person of this `Age` called `name` without shoes: always the same; 1.15 to 1.95 m.
 
-    Adults are drawn from normal distributions of 1.64 m and 1.77 m +- 0.065 m (women, men), one in ten is a child.
+    Adults are drawn from normal distributions of 1.64 m and 1.77 m +- 0.065 m (women, men).
     """
     draw = zlib.crc32(b"stature " + name.encode())
-    if age_of(name) == "child":
+    if age == Age.CHILD:
         return 1.15 + 0.33 * (draw >> 8 & 0xFFFF) / 65535.0
     middle = 1.64 if is_woman(name) else 1.77
     bell = sum((draw >> shift & 0xFF) / 255.0 - 0.5 for shift in (0, 8, 16, 24)) / np.sqrt(4.0 / 12.0)
-    return float(middle + 0.065 * np.clip(bell, -2.5, 2.5) - (0.03 if age_of(name) == "elder" else 0.0))
-
-
-def age_of(name: str) -> str:
-    """'child', 'adult' or 'elder'; event pedestrians and residents are grown up."""
-    share = zlib.crc32(b"age " + name.encode()) / 2**32
-    if share < _CHILD and name[0] not in "en":
-        return "child"
-    return "elder" if share > 1.0 - _ELDER else "adult"
+    return float(middle + 0.065 * np.clip(bell, -2.5, 2.5) - (0.03 if age == Age.ELDERLY else 0.0))
 
 
 def is_woman(name: str) -> bool:
@@ -81,16 +74,16 @@ class Strides:
     _rows: RowLookup = field(default_factory=RowLookup)
     _table: Floats = field(default_factory=lambda: np.zeros((1, 5)))
 
-    def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats) -> tuple[Floats, Floats]:
+    def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats, age: Sequence[int]) -> tuple[Floats, Floats]:
         """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their speeds (N,), or the
-        paces that those show who tread on the spot.
+        paces that those show who tread on the spot. age: of each, an `Age`.
 
         Who is new begins somewhere in a stride, drawn from the name, at the pace of the moment.
         """
         row, known = self._rows.of(ids)
         before = self._table[row]
         for i in np.flatnonzero(~known).tolist():
-            before[i] = (*xy[i], first_stride(ids[i]), speed[i], stature_m(ids[i]))
+            before[i] = (*xy[i], first_stride(ids[i]), speed[i], stature_m(ids[i], age[i]))
         at, strides, pace, stature = before[:, :2], before[:, 2], before[:, 3], before[:, 4]
         pace = pace + (speed - pace) * min(self.period_s / SETTLE_S, 1.0)
         moved = np.hypot(xy[:, 0] - at[:, 0], xy[:, 1] - at[:, 1])

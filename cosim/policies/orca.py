@@ -162,14 +162,7 @@ def nearby(known: Privileged) -> People:
     forward, left = offset @ [cos, sin], offset @ [-sin, cos]
     behind = (forward < -0.3) & ((np.abs(left) < 0.6) | (forward < -2.5))
     near = (np.hypot(offset[:, 0], offset[:, 1]) < 1.5 * SEEN_M) & ~behind
-    rows = np.flatnonzero(near)
-    return People.of(
-        tuple(people.ids[i] for i in rows),
-        people.xy[rows],
-        people.heading[rows],
-        people.speed[rows],
-        tuple(people.doing[i] for i in rows),
-    )
+    return people.only(np.flatnonzero(near))
 
 
 def walks(people: People) -> Floats:

@@ -176,18 +176,16 @@ class Recorder:
     def __init__(self, tick_s: float) -> None:
         self._tick_s = tick_s
         self._rows: list[tuple[float, ...]] = []
-        self._people: list[tuple[int, float, float, bool, bool]] = []
+        self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
         self._rows.append(log_row(step, verdict, road))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
-            people = step.street_after.people
-            for i in np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M):
-                x, y = people.xy[i]
-                kind = people.ids[i][0]
-                self._people.append((step.tick, float(x), float(y), kind == "e", kind == "n"))
+            people = step.street_after.people.only(np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M))
+            for xy, kind, age in zip(people.xy.tolist(), people.kind.tolist(), people.age.tolist(), strict=True):
+                self._people.append((step.tick, *xy, kind, age))
 
     def log(self, event_tracks: Floats) -> Log:
         """The episode so far. event_tracks: see `Log`."""
@@ -207,7 +205,7 @@ class Recorder:
             vehicles_braked=rows[:, 13].astype(np.int64),
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
-            people_event=people[:, 3] > 0,
-            people_resident=people[:, 4] > 0,
+            people_kind=people[:, 3].astype(np.int8),
+            people_age=people[:, 4].astype(np.int8),
             event_tracks=event_tracks,
         )

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
+from cosim.core.state import DIRECTED, PersonKind
 from cosim.episode.log import Log
 from cosim.place.street_map import Lane, StreetMap
 from cosim.records.record import Record
@@ -124,9 +125,9 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
         across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
         middle = np.array([barrier.x_m, barrier.y_m])
         sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
-    sheet.dot(log.people_xy[~(log.people_event | log.people_resident)], PERSON, 0.15)
-    sheet.dot(log.people_xy[log.people_resident], RESIDENT, 0.2)
-    sheet.dot(log.people_xy[log.people_event], EVENT, 0.25)
+    sheet.dot(log.people_xy[log.people_kind == PersonKind.CROWD], PERSON, 0.15)
+    sheet.dot(log.people_xy[log.people_kind == PersonKind.RESIDENT], RESIDENT, 0.2)
+    sheet.dot(log.people_xy[np.isin(log.people_kind, DIRECTED)], EVENT, 0.25)
     draw_track(sheet, log)
     sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
     sheet.text(scenario.start[:2], "start", TRACK, END_M)

@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from cosim.core.geometry import Floats
-from cosim.core.state import PERSON_RADIUS_M, People, RobotState, Street
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People, RobotState, Street
 from cosim.place.street_map import StreetMap
 from cosim.report.above import BARRIER, EVENT, GROUND_COLOUR, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
 from cosim.report.legend import Image, Rgb255
@@ -27,8 +27,8 @@ VEHICLE: Final[Rgb255] = (60, 80, 130)
 _WALK: Final[Rgb255] = (0, 170, 80)
 RED_SIGNAL: Final[Rgb255] = (220, 30, 30)
 _INK: Final[Rgb255] = (40, 40, 40)
-COLOURS: Final[dict[str, Rgb255]] = {"e": EVENT, "n": RESIDENT}
-"""Of people, by the first letter of their id; all others are background walkers."""
+COLOURS: Final = (PERSON, EVENT, RESIDENT, EVENT)
+"""Of people, by their kind."""
 _NOSE_M: Final = 0.62
 """From the middle of a person to the tip that shows where the body faces."""
 
@@ -95,11 +95,11 @@ class Minimap:
 
 def _draw_people(sheet: Sheet, people: People) -> None:
     """Everybody with a nose; event people over the others, with what they do."""
-    event = np.array([name.startswith("e") for name in people.ids], dtype=bool)
+    event = people.are(*DIRECTED)
     ahead = np.column_stack([np.cos(people.heading), np.sin(people.heading)])
     for row in np.argsort(event, kind="stable").tolist():
         xy, way = people.xy[row], ahead[row]
-        colour = COLOURS.get(people.ids[row][0], PERSON)
+        colour = COLOURS[people.kind[row]]
         aside = 0.8 * PERSON_RADIUS_M * np.array([-way[1], way[0]])
         nose = shapely.Polygon([xy + _NOSE_M * way, xy + aside, xy - aside])
         body = shapely.MultiPolygon([shapely.Point(*xy).buffer(PERSON_RADIUS_M), nose])

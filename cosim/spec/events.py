@@ -13,7 +13,7 @@ from typing import Annotated, Final, Literal
 
 import msgspec
 
-from cosim.core.state import PERSON_RADIUS_M, Doing
+from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
 EventName = Literal[
@@ -65,7 +65,7 @@ class Event(Ranged, frozen=True, kw_only=True):
                 f"event id {shown(self.id)}: ids of event pedestrians start with 'e', "
                 "and at most 31 of A-Z a-z 0-9 _ - follow"
             )
-        if self.id.startswith(GUEST):
+        if re.match(GUEST, self.id):
             yield f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians"
         fewest, most = GROUPS[self.kind]
         if not fewest <= self.people <= most:
@@ -110,8 +110,7 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):
-    """A pedestrian of ours as the world shows it at one tick. id: of its event, with "-1", "-2" for the further ones; a
-    guest's starts with "ei-", a resident's with "n".
+    """A pedestrian of ours as the world shows it at one tick. id: unlike all others; see `Event.names`.
 
     speed_mps: of its last step. pace_mps: the speed that its body shows where that is another: who turns or rises on
     the spot treads.
@@ -123,17 +122,20 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
     heading_rad: float
     speed_mps: float
     doing: Doing
+    kind: PersonKind
+    age: Age = Age.ADULT
     pace_mps: float | None = None
 
 
 class Bystander(msgspec.Struct, frozen=True, array_like=True):
-    """Somebody who is not of an event: id, place and velocity. Ids of guests start with "e", of residents with "n"."""
+    """Somebody who is not of an event: place, velocity and kind."""
 
     id: str
     x_m: float
     y_m: float
     vx_mps: float
     vy_mps: float
+    kind: PersonKind = PersonKind.CROWD
 
 
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):

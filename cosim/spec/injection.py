@@ -31,6 +31,7 @@ class Injection(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields
     speed_mps: float = 1.3
     heading_rad: float | None = None
     doing: Doing = "stand"
+    age: Literal["adult", "child", "elderly"] = "adult"
     stay_s: float = 30.0
 
     def __post_init__(self) -> None:

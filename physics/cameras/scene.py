@@ -126,9 +126,11 @@ class BulletScene:
         parts = placed_parts(who, self._surface.heights(who.xy), time_s)
         for rigs in self._walkers.values():
             rigs.start()
-        for name, at, turn in zip(who.ids, parts.at_m.tolist(), parts.turn.tolist(), strict=True):
-            bodies = self._walkers[family_of(name)].lend()
-            for k, (body, colour) in enumerate(zip(bodies, part_colours(name), strict=True)):
+        for name, age, at, turn in zip(
+            who.ids, who.age.tolist(), parts.at_m.tolist(), parts.turn.tolist(), strict=True
+        ):
+            bodies = self._walkers[family_of(name, age)].lend()
+            for k, (body, colour) in enumerate(zip(bodies, part_colours(name, age), strict=True)):
                 self._canvas.put_at(body, at[k], turn[k])
                 if self._painted.get(body) != colour:
                     self._painted[body] = colour

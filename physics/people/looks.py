@@ -1,4 +1,4 @@
-"""Who looks how: body, clothes and colours of a person from the name, always the same."""
+"""Who looks how: body, clothes and colours of a person from its name and age, always the same."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.people.gait import age_of, is_woman
+from cosim.core.state import Age
+from cosim.people.gait import is_woman
 from physics.people.body import COATS, Outfit
 from physics.people.families import Family
 from physics.people.figure import Build
@@ -79,20 +80,19 @@ class Look:
     girth_m: float
 
 
-def family_of(name: str) -> Family:
-    """Whose skeleton the person has."""
-    age = age_of(name)
-    if age == "child":
+def family_of(name: str, age: int) -> Family:
+    """Whose skeleton the person of this `Age` has."""
+    if age == Age.CHILD:
         return "child"
-    if age == "elder":
+    if age == Age.ELDERLY:
         return "elder"
     return "woman" if is_woman(name) else "man"
 
 
 @lru_cache(maxsize=65536)
-def look_of(name: str, seed: int = 0) -> Look:
-    """The look of the person called `name`; another seed dresses everybody anew, with the same age and stature."""
-    family = family_of(name)
+def look_of(name: str, age: int, seed: int = 0) -> Look:
+    """The look of the person of this `Age` called `name`; another seed dresses everybody anew, at the same stature."""
+    family = family_of(name, age)
     choices = [outfit for outfit in OUTFITS[family] if _fits(outfit, name)]
     outfit = choices[_draw(name, seed, "outfit") % len(choices)]
     skin = _pick(_SKINS, name, seed, "skin")

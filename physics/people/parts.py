@@ -116,7 +116,8 @@ def placed_parts(people: People, z_m: Floats, time_s: float) -> _Placed:
     clips = own_clips()
     posed = poses(people, time_s, clips)
     matrices = posed.matrices(clips)[:, _CARRIERS].astype(float)
-    rest = np.array([_joints(family_of(name)) for name in people.ids]).reshape(len(people), len(RIGID_PARTS), 3)
+    families = map(family_of, people.ids, people.age.tolist())
+    rest = np.array([_joints(family) for family in families]).reshape(len(people), len(RIGID_PARTS), 3)
     turn = matrices[..., :3]
     at = (np.einsum("npab,npb->npa", turn, rest) + matrices[..., 3]) * posed.scale[:, None, None]
     cos, sin = np.cos(people.heading), np.sin(people.heading)
@@ -134,9 +135,9 @@ def _joints(family: Family) -> Floats:
 
 
 @lru_cache(maxsize=4096)
-def part_colours(name: str) -> tuple[Colour, ...]:
-    """The colours of the parts of the person called `name`."""
-    who = look_of(name)
+def part_colours(name: str, age: int) -> tuple[Colour, ...]:
+    """The colours of the parts of the person of this `Age` called `name`."""
+    who = look_of(name, age)
     outfit = ALL[who.outfit]
     red, green, blue = (who.colours / 255.0).T.tolist()
     colours = dict(zip(COATS, zip(red, green, blue, strict=True), strict=True))

@@ -47,7 +47,7 @@ def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
     clips = own_clips() if clips is None else clips
     if not len(people):
         return Poses(np.zeros((0, 4), np.intp), np.zeros((0, 4), np.float32), np.zeros(0))
-    family, stature, size, offset = _facts_of(people.ids)
+    family, stature, size, offset = _facts_of(people.ids, people.age.tobytes())
     pace = relative_pace(people.pace, stature)
     knot = _PACES[1:-1].searchsorted(pace, side="right")
     faster = np.minimum(np.maximum((pace - _PACES[knot]) / _APART[knot], 0.0), 1.0)
@@ -95,16 +95,16 @@ def _standing(
 
 
 @lru_cache(maxsize=32)
-def _facts_of(names: tuple[str, ...]) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
-    facts = np.array([_facts(name) for name in names])
+def _facts_of(names: tuple[str, ...], ages: bytes) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
+    facts = np.array([_facts(name, age) for name, age in zip(names, ages, strict=True)])
     return facts[:, 0].astype(np.intp), facts[:, 1], facts[:, 2], facts[:, 3]
 
 
 @lru_cache(maxsize=65536)
-def _facts(name: str) -> tuple[float, float, float, float]:
+def _facts(name: str, age: int) -> tuple[float, float, float, float]:
     """Row of the family, stature m, factor on the family's body, where in a loop the person is at time 0."""
-    family: Family = family_of(name)
-    stature = stature_m(name)
+    family: Family = family_of(name, age)
+    stature = stature_m(name, age)
     return float(FAMILIES.index(family)), stature, stature / _STATURES[family], first_stride(name)
 
 

@@ -20,7 +20,7 @@ from shapely.geometry import LineString, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose, wrap_angle
-from cosim.core.state import Command, Motion, RobotState, Street, write_protected
+from cosim.core.state import Command, Motion, PersonKind, RobotState, Street, write_protected
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.place.street_map import StreetMap
@@ -138,7 +138,7 @@ def _drive(
     def watch(step: Step, _: Verdict) -> None:
         nonlocal persons
         street = step.street_after
-        persons += sum(name.startswith("c") for name in street.people.ids)
+        persons += int(street.people.are(PersonKind.CROWD).sum())
         tally.see(street)
         tally.drove(lines.passed(street.vehicles.ids))
         if (step.tick + 1) % GROUPS_EVERY_TICKS == 0:

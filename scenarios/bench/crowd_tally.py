@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats, boxes_overlap
-from cosim.core.state import PERSON_RADIUS_M, People, Street, Vehicles
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People, PersonKind, Street, Vehicles
 from cosim.place.street_map import StreetMap, Strip
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ class Tally:
             return
         pairs = cKDTree(people.xy).query_pairs(CONTACT_M, output_type="ndarray")
         gap = np.hypot(*(people.xy[pairs[:, 0]] - people.xy[pairs[:, 1]]).T)
-        event = np.array([name.startswith("e") for name in people.ids])
+        event = people.are(*DIRECTED)
         own = ~(event[pairs].all(axis=1)) if len(pairs) else np.zeros(0, dtype=bool)
         self.counts["pairs in contact range"] += float(own.sum()) * self._tick_s
         self.counts["pairs nearer than 0.6 m"] += float((own & (gap < 2 * PERSON_RADIUS_M)).sum()) * self._tick_s
@@ -116,9 +116,10 @@ class Tally:
             self.counts[f"overlaps: {self._where(tick, people, i, j)}"] += self._tick_s
 
     def _where(self, tick: int, people: People, i: int, j: int) -> str:
-        if "e" in (people.ids[i][0], people.ids[j][0]):
+        pair = people.kind[[i, j]]
+        if np.isin(pair, DIRECTED).any():
             return "with an event pedestrian"
-        if "n" in (people.ids[i][0], people.ids[j][0]):
+        if PersonKind.RESIDENT in pair:
             return "with a resident"
         if (tick - max(self._since[people.ids[i]], self._since[people.ids[j]])) * self._tick_s < ENTERING_S:
             return "entering"
@@ -150,7 +151,7 @@ class Tally:
         if len(vehicles):
             gap = box_gaps(vehicles, people.xy)
             self.counts["in a vehicle"] += float((gap <= 0.0).any(axis=0).sum()) * seconds
-            crowd = np.array([name.startswith("c") for name in people.ids])
+            crowd = people.are(PersonKind.CROWD)
             moving = (gap <= 0.0) & (vehicles.speed[:, None] > ROLLING_MPS)
             self.counts["in a vehicle that moves"] += float((moving.any(axis=0) & crowd).sum()) * seconds
 
@@ -161,7 +162,7 @@ class Tally:
     def _signals(self, street: Street) -> None:
         """Entries of people, tick by tick; vehicles on crossings at walk, now and then."""
         people, vehicles = street.people, street.vehicles
-        crowd = np.array([name.startswith("c") for name in people.ids], dtype=bool)
+        crowd = people.are(PersonKind.CROWD)
         now: set[str] = set()
         over: set[tuple[str, str]] = set()
         looks = street.tick % EVERY_TICKS == 0

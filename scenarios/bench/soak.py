@@ -20,7 +20,7 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
 from cosim.core.geometry import Floats, Polyline, Pose
-from cosim.core.state import RobotState
+from cosim.core.state import PersonKind, RobotState
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
@@ -110,8 +110,8 @@ def simulated(where: Place, seed: int, ticks: int) -> Iterator[Endured]:
         for tick in range(ticks):
             robot, *others = map(next, bodies)
             actors = tuple(
-                Actor(id=f"e{i}", x_m=pose.x_m, y_m=pose.y_m, heading_rad=pose.heading_rad, speed_mps=1.5, doing="walk")
-                for i, pose in enumerate(others)
+                Actor(id=f"e{i}", x_m=x, y_m=y, heading_rad=way, speed_mps=1.5, doing="walk", kind=PersonKind.EVENT)
+                for i, (x, y, way) in enumerate(others)
             )
             street = crowd.step(RobotState(robot), EventReply(episode="", tick=tick, states=(), actors=actors))
             persons += len(street.people) - len(actors)

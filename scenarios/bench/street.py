@@ -11,7 +11,7 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Pose
-from cosim.core.state import RobotState
+from cosim.core.state import PersonKind, RobotState
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import CrowdSpec
 from scenarios.bench.speed import Spent, alone, scenario_in
@@ -82,6 +82,7 @@ def cast(middle: Pose) -> tuple[Actor, ...]:
             heading_rad=heading_rad,
             speed_mps=PACE_MPS,
             doing="walk",
+            kind=PersonKind.EVENT,
         )
         for k, left_m in enumerate(_ABREAST_M * (n - (CAST - 1) / 2) for n in range(CAST))
     )

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
+from cosim.core.state import Age, PersonKind
 from cosim.people.yielding import STEP_ROUND_GAP_M, touches
 from cosim.spec.events import GUEST, Actor, EventQuery, Walker
 from cosim.spec.injection import Injected, Injection
@@ -85,4 +86,6 @@ def guest_actor(guest: Guest, tick_ms: int) -> Actor:
         heading_rad=walker.heading_rad,
         speed_mps=guest.moved_m * 1000 / tick_ms,
         doing=still if guest.moved_m < 1e-6 else "walk",
+        kind=PersonKind.INJECTED,
+        age=Age[guest.injection.age.upper()],
     )

@@ -9,6 +9,7 @@ from types import MappingProxyType
 import msgspec
 
 from cosim.core.errors import SpecError
+from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventName, EventQuery, EventReply, EventState
 from scenarios.events.behavior import Behavior
 from scenarios.events.crossing import PED_CROSSING
@@ -102,6 +103,7 @@ def _shown(event: Event, before: EventState, after: EventState, query: EventQuer
                 heading_rad=new.heading_rad,
                 speed_mps=moved_m * 1000 / query.tick_ms,
                 doing=behavior_of(event).doing(event, after, number) if moved_m < 1e-6 else "walk",
+                kind=PersonKind.EVENT,
             )
         )
     return actors

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from cosim.core.state import PERSON_RADIUS_M
+from cosim.core.state import PERSON_RADIUS_M, PersonKind
 from cosim.people.orca import HalfPlane
 from cosim.people.steering import HORIZON_S, ROOM_M, SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
 from cosim.spec.events import Bystander, Event, EventQuery, Walker
@@ -80,7 +80,7 @@ def _told_apart(name: str, guest: Walker, other: Bystander) -> Bystander:
     return msgspec.structs.replace(other, x_m=guest.x_m - left_m * sin, y_m=guest.y_m + left_m * cos)
 
 
-def fellow(walker: Walker) -> Neighbour:
+def fellow(walker: Walker | Bystander) -> Neighbour:
     """Somebody who steers the same way, but for who stands: that one stays."""
     moves = walker.vx_mps != 0.0 or walker.vy_mps != 0.0
     return Neighbour(walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, SHARED if moves else 1.0)
@@ -89,8 +89,7 @@ def fellow(walker: Walker) -> Neighbour:
 def met(bystanders: Iterable[Bystander]) -> list[Neighbour]:
     """The crowd pays no heed; guests and residents who walk steer the same way."""
     return [
-        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps, SHARED if b.id[0] in "en" and (b.vx_mps or b.vy_mps) else 1.0)
-        for b in bystanders
+        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b) for b in bystanders
     ]
 
 

@@ -9,8 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from cosim.core.clock import Clock
-from cosim.core.state import RobotState
+from cosim.core.state import People, PersonKind, RobotState, Street
 from cosim.episode.step import Step
 from cosim.judge.delay import Delay, Tracks, delay_of
 from cosim.judge.referee import Verdict
@@ -49,23 +51,28 @@ class Beside:
 
     def __init__(self) -> None:
         self._moments: list[tuple[RobotState, EventReply]] = []
-        self._present = Tracks("c"), Tracks("v")
+        self._present = Tracks(), Tracks()
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """The next tick of the episode."""
         self._moments.append((step.robot, step.events))
-        self._present[0].add(step.street_after.people)
+        self._present[0].add(_crowd(step.street_after))
         self._present[1].add(step.street_after.vehicles)
 
     def compared(self, scenario: Scenario, entrances: Entrances, tell: TellShare = untold_share) -> Compared:
         """entrances: of the episode. No SUMO may be running in this process."""
-        absent = Tracks("c"), Tracks("v")
+        absent = Tracks(), Tracks()
         with crowd_of(scenario, entrances) as crowd:
             for tick, (robot, reply) in enumerate(self._moments):
                 if tick % TELL_EVERY_TICKS == 0:
                     tell(tick / len(self._moments))
                 street = crowd.step(robot, reply, absent=True)
-                absent[0].add(street.people)
+                absent[0].add(_crowd(street))
                 absent[1].add(street.vehicles)
         at = [(robot.pose.x_m, robot.pose.y_m) for robot, _ in self._moments]
         return Compared(*(delay_of(at, a, b, Clock().tick_s) for a, b in zip(self._present, absent, strict=True)))
+
+
+def _crowd(street: Street) -> People:
+    """Those who come and go by themselves: event pedestrians and guests are where they were."""
+    return street.people.only(np.flatnonzero(street.people.are(PersonKind.CROWD)))

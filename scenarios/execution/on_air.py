@@ -14,6 +14,7 @@ from bridge import keys
 from bridge.live import serve_injections
 from bridge.session import Session
 from cosim.core.clock import Clock
+from cosim.core.state import Age, PersonKind
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.spec.injection import Injected, Live
@@ -69,16 +70,21 @@ class OnAir:
         self._happened += [(tick, words) for words in news]
         x_m, y_m, heading_rad = robot.pose
         crowd = [
-            {"id": name, "x_m": x, "y_m": y, "heading_rad": heading, "speed_mps": speed, "doing": doing}
-            for name, (x, y), heading, speed, doing in zip(
+            {
+                "id": name, "x_m": x, "y_m": y, "heading_rad": heading, "speed_mps": speed, "doing": doing,
+                "kind": PersonKind(kind).name.lower(), "age": Age(age).name.lower(),
+            }
+            for name, (x, y), heading, speed, doing, kind, age in zip(
                 street.people.ids,
                 street.people.xy.tolist(),
                 street.people.heading.tolist(),
                 street.people.speed.tolist(),
                 street.people.doing,
+                street.people.kind.tolist(),
+                street.people.age.tolist(),
                 strict=True,
             )
-        ]
+        ]  # fmt: skip
         topics: dict[str, object] = {
             "clock": {"tick": tick, "time_s": Clock().time_s(tick)},
             "robot": {

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import People
+from cosim.core.state import Age, People, PersonKind
 from cosim.episode.ports import Director
 from cosim.people.steering import STEERING_NEAR_M, Neighbour
 from cosim.place.street_map import StreetMap
@@ -37,6 +37,7 @@ from scenarios.residents.resident import (
     wants_to_choose,
 )
 from sumo_nets.crowd.demand import FIRST_FILL_CLEAR_M, SIGHT_M
+from sumo_nets.crowd.group_sampling import ELDERLY_SHARE
 
 WITHIN_M: Final = 60.0
 """Residents appear no farther from the robot."""
@@ -137,8 +138,10 @@ class Residents:
         one = Resident(number, x, y, heading, float(rng.uniform(*SPEED_MPS)), node, choices=1)
         if settled:
             one = arrived(bound_for(one, graph, node, rng), graph)
-            return one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
-        return next_errand(one, graph, rng, {other.goal for other in self._here.values()})
+            one = one._replace(since_tick=query.tick, stay_s=one.stay_s * float(rng.random()))
+        else:
+            one = next_errand(one, graph, rng, {other.goal for other in self._here.values()})
+        return one._replace(age=Age.ELDERLY if rng.random() < ELDERLY_SHARE else Age.ADULT)
 
     def _rng(self, number: int, choice: int) -> np.random.Generator:
         return np.random.default_rng([self._seed, _KIND, number, choice])
@@ -156,7 +159,7 @@ def _around(walking: Sequence[Resident], people: People) -> dict[int, list[Neigh
         if people.ids[i] != walking[k].name:
             moving = _velocity(float(people.speed[i]), float(people.heading[i]))
             x, y = people.xy[i].tolist()
-            steers = people.ids[i][0] in "en" and people.speed[i] > STILL_MPS
+            steers = people.kind[i] != PersonKind.CROWD and people.speed[i] > STILL_MPS
             one = Neighbour(x, y, *moving, SHARED if steers else 1.0)
             found[walking[k].number].append((float(square[k, i]), one))
     return {number: [one for _, one in sorted(near)[:_MOST_NEIGHBOURS]] for number, near in found.items()}

@@ -16,7 +16,7 @@ from shapely import covers
 from shapely.geometry import LineString
 
 from cosim.core.geometry import wrap_angle
-from cosim.core.state import Doing
+from cosim.core.state import Age, Doing, PersonKind
 from cosim.people.steering import SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
 from cosim.people.yielding import stepped_round, within_reach_m
 from cosim.spec.events import Actor, EventQuery
@@ -70,6 +70,7 @@ class Resident(NamedTuple):
     shown_mps: float = 0.0
     blocked_ticks: int = 0
     choices: int = 0
+    age: Age = Age.ADULT
 
     @property
     def name(self) -> str:
@@ -87,6 +88,8 @@ def resident_actor(resident: Resident) -> Actor:
         speed_mps=math.hypot(*resident.moving_mps),
         pace_mps=resident.shown_mps,
         doing=resident.doing if here else "walk" if resident.shown_mps > 0.0 else "stand",
+        kind=PersonKind.RESIDENT,
+        age=resident.age,
     )
 
 

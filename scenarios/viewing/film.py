@@ -17,7 +17,7 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
-from cosim.core.state import RobotState, Street
+from cosim.core.state import DIRECTED, RobotState, Street
 from cosim.core.telling import Tell, untold
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
@@ -193,7 +193,7 @@ class _Reel:
 def _framed(robot: RobotState, street: Street) -> Floats:
     """(3,) metres ahead and left of the robot, and height, from which it and the event people near it can be seen."""
     cos, sin = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
-    event = [name.startswith("e") for name in street.people.ids]
+    event = street.people.are(*DIRECTED)
     offset = (street.people.xy[event] - robot.pose.xy) @ np.array([[cos, -sin], [sin, cos]])
     near = offset[np.hypot(*offset.T) < _NEAR_M]
     if not len(near):

@@ -21,7 +21,7 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, headings_from_sumo
-from cosim.core.state import People, RobotState, Street, Vehicles
+from cosim.core.state import People, PersonKind, RobotState, Street, Vehicles
 from cosim.episode.ports import Crowd
 from cosim.people.gait import Strides
 from cosim.people.yielding import RobotBody
@@ -197,6 +197,7 @@ class SumoCrowd(Crowd):
             return replayed_demand(self._before, self._map, self._spec, self._closed, self._together)
         on_foot, driving = (Kept(libsumo, self.entrances, whose) for whose in (PEDESTRIANS, DRIVERS))
         people = Pedestrians(on_foot, self._map, self._spec, rng_persons, self._closed, self._together)
+        self.entrances.ages = people.ages
         return people, Drivers(driving, self._map, self._spec, rng_vehicles)
 
     def _watch(self, x_m: float, y_m: float) -> None:
@@ -210,8 +211,8 @@ class SumoCrowd(Crowd):
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
-        if len(present) != len(actors) or not all(name[0] in "en" for name in present):
-            raise EngineError(f"actors need unique ids that start with 'e' or 'n': {[a.id for a in actors]}")
+        if len(present) != len(actors) or present & self._pedestrians.ages.keys():
+            raise EngineError(f"actors need unique ids, and none of the crowd's: {[a.id for a in actors]}")
         for name in sorted(self._actors.keys() - present):
             self._actors.pop(name).remove()
         for actor in actors:
@@ -222,7 +223,8 @@ class SumoCrowd(Crowd):
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: RobotBody | None) -> Street:
         found: dict[str, Row] = libsumo.poi.getContextSubscriptionResults(EYE)
         here = sorted(name for name, row in found.items() if row[tc.VAR_POSITION][0] > NOWHERE_M)
-        persons, vehicles = ({name: found[name] for name in here if name[0] == kind} for kind in "cv")
+        persons = {name: found[name] for name in here if name in self._pedestrians.ages}
+        vehicles = {name: found[name] for name in here if tc.VAR_ANGLE in found[name]}
         self._found = persons, vehicles
         people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
@@ -240,13 +242,16 @@ class SumoCrowd(Crowd):
         places = np.concatenate([xy, others])
         speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
         paces = np.concatenate([speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]])
+        ages = [*(self._pedestrians.ages[name] for name in ids), *(a.age for a in cast)]
         return People.of(
             names,
             places,
             np.concatenate([heading, [a.heading_rad for a in cast]]),
             speeds,
             (*("walk" if fast else "stand" for fast in (speed > PERSON_STANDS_MPS).tolist()), *(a.doing for a in cast)),
-            *self._strides.update(names, places, paces),
+            *self._strides.update(names, places, paces, ages),
+            [*[PersonKind.CROWD] * len(ids), *(a.kind for a in cast)],
+            ages,
         )
 
     def _vehicles(self, vehicles: dict[str, Row]) -> Vehicles:

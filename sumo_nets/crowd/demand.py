@@ -1,7 +1,7 @@
 """The rolling crowd: persons and vehicles kept around the robot, wherever in the city it goes.
 
 They enter out of its sight and are taken out once they are far from it, so a step costs the same in any city. Each
-kind draws from its own generator; ids are "c<n>" and "v<n>".
+kind draws from its own generator.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from cosim.core.geometry import Floats, heading_to_sumo
-from cosim.people.gait import age_of
+from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CrowdSpec
@@ -70,7 +70,7 @@ class Seen(NamedTuple):
 
 
 class Pedestrians:
-    """The background persons."""
+    """The background persons. ages: of everybody who ever entered, by name."""
 
     def __init__(
         self,
@@ -83,6 +83,7 @@ class Pedestrians:
     ) -> None:
         self._engine, self._spec, self._rng, self._closed = engine, spec, rng, closed
         self._together = together
+        self.ages: dict[str, Age] = {}
         self._graph = WalkGraph(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
         self._spots = Spots(
@@ -93,7 +94,6 @@ class Pedestrians:
             ),
             step_m=2.0,
         )
-        self._count = 0
         self._room = Room(street_map, spec.radius_m)
         self._companies = Companies(spec, rng.spawn(1)[0])
 
@@ -114,7 +114,7 @@ class Pedestrians:
         """
         person, radius_m = self._engine.person, self._spec.radius_m
         fellows = self._together.fellows
-        present = sorted(name for name in person.getIDList() if name.startswith("c"))
+        present = sorted(self.ages.keys() & set(person.getIDList()))
         self._together.forget(present)
         gone: set[str] = set()
         for name in present:
@@ -190,12 +190,11 @@ class Pedestrians:
         corner = self._graph.street_map.strips[walk[0]].corners[1 if forward else 0]
         return walk if first != second or corner is None else [walk[0], corner, *walk[1:]]
 
-    def _name(self, age: str) -> str:
-        """The next name; a person's age follows from the name, so if it matters, the next name of that age."""
-        while age and age_of(f"c{self._count}") != age:
-            self._count += 1
-        self._count += 1
-        return f"c{self._count - 1}"
+    def _name(self, age: Age) -> str:
+        """The next name, and who has it is so old."""
+        name = f"c{len(self.ages)}"
+        self.ages[name] = age
+        return name
 
     def _add(self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
         """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""

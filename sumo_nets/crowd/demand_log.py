@@ -11,6 +11,8 @@ from collections import defaultdict
 from collections.abc import Callable, Mapping
 from typing import Any, Final, NamedTuple
 
+from cosim.core.state import Age
+
 READS: Final = ("get", "subscribe")
 """Calls of SUMO that begin so change nothing."""
 _KEPT: Final = ("person", "vehicle", "route")
@@ -29,9 +31,13 @@ class Call(NamedTuple):
 
 
 class Entrances:
-    """The calls by which people and vehicles were let in and out, in order, by the simulated time in seconds."""
+    """The calls by which people and vehicles were let in and out, in order, by the simulated time in seconds.
+
+    ages: of the people, by name.
+    """
 
     def __init__(self) -> None:
+        self.ages: dict[str, Age] = {}
         self._calls: dict[tuple[str, float], list[Call]] = defaultdict(list)
 
     def keep(self, whose: str, time_s: float, call: Call) -> None:

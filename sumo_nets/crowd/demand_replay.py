@@ -24,6 +24,7 @@ def replayed_demand(
     people = PedestriansAgain(libsumo, street_map, spec, nothing, closed, together)
     drivers = DriversAgain(libsumo, street_map, spec, nothing)
     people.before = drivers.before = before
+    people.ages = before.ages
     drivers.sizes = {
         str(call.arguments[0]): VEHICLE_TYPES[call.options["typeID"]][:2]
         for call in before.of(DRIVERS, ADDS)

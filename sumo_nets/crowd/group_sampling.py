@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from cosim.core.state import Age
 from cosim.spec.scenario import CrowdSpec
 
 PERSON_MPS: Final = (1.1, 1.65)
@@ -31,10 +32,14 @@ GROUP_STRIPE_M: Final = 0.64
 ROW_M: Final = 0.8
 
 
-class Company(NamedTuple):
-    """Those who enter together, one or more. ages: 'adult', 'elder' or 'child', or '' where nobody asked for ages."""
+CHILDREN_SHARE, ELDERLY_SHARE = 0.10, 0.12
+"""Of those whose ages nobody asked for."""
 
-    ages: tuple[str, ...]
+
+class Company(NamedTuple):
+    """Those who enter together, one or more. ages: of each."""
+
+    ages: tuple[Age, ...]
     pace_mps: tuple[float, float] = PERSON_MPS
 
     @property
@@ -64,7 +69,7 @@ class Companies:
     """
 
     def __init__(self, spec: CrowdSpec, rng: np.random.Generator) -> None:
-        self._rng = rng
+        self._rng, self._rng_ages = rng, rng.spawn(1)[0]
         self._ages = spec.elderly > 0.0 or spec.children > 0.0
         mean_size = 2.0 + TRIO_SHARE
         self._grouped = spec.groups / (spec.groups + (1.0 - spec.groups) * mean_size)
@@ -80,14 +85,19 @@ class Companies:
 
     def _draw(self) -> Company:
         if self.plain:
-            return Company(("",))
+            return Company(self._any_ages(1))
         grouped, trio, family, second, elder = self._rng.random(5).tolist()
         size = 1 if grouped >= self._grouped else 3 if trio < TRIO_SHARE else 2
         if not self._ages:
-            return Company(("",) * size)
+            return Company(self._any_ages(size))
         if size > 1 and family < self._family:
             children = size - 1 if second < 0.5 else 1
-            return Company(("adult",) * (size - children) + ("child",) * children, SLOWEST_GROUP_MPS)
+            return Company((Age.ADULT,) * (size - children) + (Age.CHILD,) * children, SLOWEST_GROUP_MPS)
         if elder < self._elder:
-            return Company(("elder",) * size, SLOWEST_GROUP_MPS)
-        return Company(("adult",) * size)
+            return Company((Age.ELDERLY,) * size, SLOWEST_GROUP_MPS)
+        return Company((Age.ADULT,) * size)
+
+    def _any_ages(self, size: int) -> tuple[Age, ...]:
+        """How old they look where the spec asks for no ages; all walk alike."""
+        shares = [1.0 - CHILDREN_SHARE - ELDERLY_SHARE, CHILDREN_SHARE, ELDERLY_SHARE]
+        return tuple(map(Age, self._rng_ages.choice(3, size, p=shares).tolist()))

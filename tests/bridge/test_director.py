@@ -15,6 +15,7 @@ from bridge.codec import decode, encode
 from bridge.director import RemoteDirector, opened, serve_director, signed
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError, SpecError
+from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
 from tests.conftest import PATIENCE_S
 
@@ -93,8 +94,9 @@ def event(**fields: object) -> Event:
 SANE = EventState(phase="waiting", since_tick=0, walkers=(Walker(x_m=1.0, y_m=0.0, heading_rad=0.0),))
 NOWHERE = msgspec.structs.replace(SANE, walkers=(Walker(x_m=math.nan, y_m=0.0, heading_rad=0.0),))
 CROWDED = msgspec.structs.replace(SANE, walkers=SANE.walkers * 3)
-SHOWN = Actor(id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand")
+SHOWN = Actor(id="e0", x_m=1.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand", kind=PersonKind.EVENT)
 FAST = msgspec.structs.replace(SHOWN, speed_mps=math.inf)
+DISGUISED = msgspec.structs.replace(SHOWN, kind=PersonKind.RESIDENT)
 STRANGER = msgspec.structs.replace(SHOWN, id="e7")
 
 
@@ -109,6 +111,7 @@ STRANGER = msgspec.structs.replace(SHOWN, id="e7")
         ({"states": (NOWHERE,)}, "no number"),
         ({"actors": (FAST,)}, "no number"),
         ({"actors": (STRANGER,)}, "people of no event, or twice: e7"),
+        ({"actors": (DISGUISED,)}, "people of events as others: e0"),
         ({"actors": (SHOWN, SHOWN)}, "people of no event, or twice"),
     ],
 )

@@ -11,12 +11,11 @@ from cosim.judge.delay import Tracks, delay_of
 
 def tracks(*ways: list[float]) -> Tracks:
     """People c0, c1, ... on lines 20 m apart who are at these x, tick by tick; all of equal length."""
-    told = Tracks("c")
+    told = Tracks()
     for xs in zip(*ways, strict=True):
         n = len(xs)
-        names = (*(f"c{i}" for i in range(n)), "e0")
-        xy = [*((x, 20.0 * i) for i, x in enumerate(xs)), (0.0, 0.0)]
-        told.add(People.of(names, xy, np.zeros(n + 1), np.zeros(n + 1), ("walk",) * (n + 1)))
+        names, xy = tuple(f"c{i}" for i in range(n)), [(x, 20.0 * i) for i, x in enumerate(xs)]
+        told.add(People.of(names, xy, np.zeros(n), np.zeros(n), ("walk",) * n))
     return told
 
 
@@ -28,7 +27,7 @@ HELD_UP = [0.05 * min(k, 100) for k in range(201)]
 
 def test_who_stands_for_five_seconds_is_late_by_them() -> None:
     """One of two people, near the robot, is held up for 5 s, less the time for half a metre; the other, far from it, is
-    not; event pedestrians do not count."""
+    not."""
     robot = [(5.0, 1.0)] * 201
     found = delay_of(robot, tracks(HELD_UP, WALK), tracks(WALK, WALK), 0.05)
     assert found.delay_s == pytest.approx(4.5) and found.near_s == pytest.approx(4.5)

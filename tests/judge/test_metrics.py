@@ -25,8 +25,8 @@ def log(s_m: list[float], *, resets: dict[int, float] | None = None, person_m: f
         speed=np.column_stack([moved / 0.05, np.zeros(n)]), command=np.zeros((n, 2)), route_s_m=s, travelled_m=moved,
         person_m=np.full(n, person_m), reset_s_m=reset, waits_at_red=np.zeros(n, bool),
         on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
-        people_tick=np.zeros(0, np.int64), people_xy=np.zeros((0, 2)), people_event=np.zeros(0, bool),
-        people_resident=np.zeros(0, bool),
+        people_tick=np.zeros(0, np.int64), people_xy=np.zeros((0, 2)), people_kind=np.zeros(0, np.int8),
+        people_age=np.zeros(0, np.int8),
         event_tracks=np.zeros((0, 5)),
     )  # fmt: skip
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cosim.core.state import LABELS, People
+from cosim.core.state import LABELS, Age, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
@@ -112,7 +112,7 @@ def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     taken = shot((0.0, 0.0, 1.0), (5.0, 0.0, 1.0), (400, 400), 40.0)
     rows, columns = np.nonzero(mask(crowd, people, taken))
     pose = poses(people, 2.0)
-    who = look_of("c3")
+    who = look_of("c3", Age.ADULT)
     made = body(ALL[who.outfit], 1)
     grown = made.vertices + made.normals * (made.fat * who.girth_m)[:, None]
     at = skinned(grown, made.joints, made.weights, pose.matrices(own_clips())[0]) * pose.scale[0]

@@ -12,7 +12,7 @@ import pytest
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
-from cosim.core.state import PERSON_RADIUS_M, People
+from cosim.core.state import PERSON_RADIUS_M, Age, People
 from cosim.people.gait import PACES_MPS, STRIDES_M, Strides, first_stride, stature_m, stride_m
 from physics.people.body import COATS, SkinnedBody, body, far_body
 from physics.people.captures import capture, read_capture
@@ -127,9 +127,9 @@ def test_feet_do_not_slide(pace: float) -> None:
     """While the ball of a foot is down it drifts by less than 1 cm per step, at baked paces and between."""
     people = People.of(("c1",), [[0.0, 0.0]], [0.0], [pace], ("walk",))
     clips = own_clips()
-    length = float(stride_m(pace, stature_m("c1")))
+    length = float(stride_m(pace, stature_m("c1", Age.ADULT)))
     phases = np.linspace(0.14, 0.52, 39)
-    ball = skeleton(family_of("c1")).rest_m[INDEX["left_foot"]]
+    ball = skeleton(family_of("c1", Age.ADULT)).rest_m[INDEX["left_foot"]]
     at = []
     for phase in phases:
         pose = poses(People.of(people.ids, people.xy, people.heading, people.speed, people.doing, [phase]), 0.0, clips)
@@ -193,28 +193,29 @@ def test_talkers_speak_and_listen() -> None:
         assert 0.35 < up.mean() < 0.65
 
 
-def test_looks_hang_on_the_name_alone() -> None:
+def test_looks_hang_on_name_and_age_alone() -> None:
     """The same name looks the same in another process, another seed dresses it anew at the same stature."""
-    names = [f"c{i}" for i in range(60)]
+    names = [(f"c{i}", i % 3) for i in range(60)]
     code = (
         f"from physics.people.looks import look_of\n"
-        f"for n in {names!r}: w = look_of(n); print(w.outfit, w.colours.tolist())"
+        f"for n in {names!r}: w = look_of(*n); print(w.outfit, w.colours.tolist())"
     )
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, cwd=ROOT)
-    assert said.stdout.splitlines() == [f"{look_of(n).outfit} {look_of(n).colours.tolist()}" for n in names]
-    assert len({look_of(n).outfit for n in names}) > 12
-    assert len({look_of(n).colours.tobytes() for n in names}) == 60
-    assert sum(look_of(n, 7).colours.tobytes() != look_of(n).colours.tobytes() for n in names) == 60
+    assert said.stdout.splitlines() == [f"{look_of(*n).outfit} {look_of(*n).colours.tolist()}" for n in names]
+    assert len({look_of(*n).outfit for n in names}) > 12
+    assert len({look_of(*n).colours.tobytes() for n in names}) == 60
+    assert sum(look_of(*n, 7).colours.tobytes() != look_of(*n).colours.tobytes() for n in names) == 60
 
 
 def test_statures_are_of_all_ages() -> None:
-    """Of a thousand people about a tenth are children, adults are 1.4 to 2 m tall, event pedestrians are grown up."""
+    """Of a thousand names each is a child, an adult or an elder, as is asked; adults are 1.4 to 2 m tall."""
     names = [f"c{i}" for i in range(1000)]
-    children = [stature_m(n) for n in names if family_of(n) == "child"]
-    grown = [stature_m(n) for n in names if family_of(n) in ("man", "woman")]
-    assert 60 < len(children) < 140 and min(children) > 1.1 and max(children) < 1.5
+    children, grown, old = ([stature_m(name, age) for name in names] for age in (Age.CHILD, Age.ADULT, Age.ELDERLY))
+    assert {family_of(name, Age.CHILD) for name in names} == {"child"}
+    assert {family_of(name, Age.ADULT) for name in names} == {"man", "woman"}
+    assert {family_of(name, Age.ELDERLY) for name in names} == {"elder"}
+    assert min(children) > 1.1 and max(children) < 1.5 and np.mean(old) < np.mean(grown)
     assert min(grown) > 1.40 and max(grown) < 2.0 and 1.66 < float(np.mean(grown)) < 1.74
-    assert not [n for n in (f"e{i}" for i in range(300)) if family_of(n) == "child"]
 
 
 def test_strides_follow_the_way_walked() -> None:
@@ -222,12 +223,12 @@ def test_strides_follow_the_way_walked() -> None:
     strides = Strides(0.05)
     start = first_stride("c1")
     for k in range(201):
-        count, pace = strides.update(("c1",), np.array([[0.05 * k, 0.0]]), np.array([1.0]))
-    assert count[0] - start == pytest.approx(10.0 / float(stride_m(1.0, stature_m("c1"))), rel=1e-6)
+        count, pace = strides.update(("c1",), np.array([[0.05 * k, 0.0]]), np.array([1.0]), [Age.ADULT])
+    assert count[0] - start == pytest.approx(10.0 / float(stride_m(1.0, stature_m("c1", Age.ADULT))), rel=1e-6)
     assert pace[0] == 1.0
-    still, pace = strides.update(("c1",), np.array([[10.0, 0.0]]), np.array([0.0]))
+    still, pace = strides.update(("c1",), np.array([[10.0, 0.0]]), np.array([0.0]), [Age.ADULT])
     assert still[0] == count[0] and 0.0 < pace[0] < 1.0
-    assert strides.update(("c1",), np.array([[50.0, 0.0]]), np.array([0.0]))[0][0] == count[0]
+    assert strides.update(("c1",), np.array([[50.0, 0.0]]), np.array([0.0]), [Age.ADULT])[0][0] == count[0]
     assert stride_m(1.4, 1.75) == pytest.approx(STRIDES_M[PACES_MPS.index(1.4)])
 
 
@@ -238,7 +239,7 @@ def test_starting_is_smooth() -> None:
     for k in range(60):
         speed = 0.0 if k < 10 or k >= 40 else 1.3
         x += 0.05 * speed
-        count, pace = strides.update(("c1",), np.array([[x, 0.0]]), np.array([speed]))
+        count, pace = strides.update(("c1",), np.array([[x, 0.0]]), np.array([speed]), [Age.ADULT])
         doing = "walk" if speed else "stand"
         now = poses(People.of(("c1",), [[x, 0.0]], [0.0], [speed], (doing,), count, pace), 0.05 * k, clips).matrices(
             clips
@@ -264,14 +265,14 @@ def test_rigid_parts_follow_the_joints() -> None:
     """Thirteen parts per person; the hand of the stopping arm is where the skinned one is."""
     people = People.of(("e1",), [[3.0, 4.0]], [0.0], [0.0], ("stop",))
     parts = placed_parts(people, np.array([0.5]), 0.0)
-    assert parts.at_m.shape == (1, len(RIGID_PARTS), 3) and len(part_colours("e1")) == len(RIGID_PARTS) == 13
+    assert parts.at_m.shape == (1, len(RIGID_PARTS), 3) and len(part_colours("e1", Age.ADULT)) == len(RIGID_PARTS) == 13
     assert np.linalg.norm(parts.turn, axis=-1) == pytest.approx(1.0)
-    family = family_of("e1")
+    family = family_of("e1", Age.ADULT)
     wrist = [joint for joint, _ in RIGID_PARTS].index("right_wrist")
     x, y, z, w = parts.turn[0, wrist]
     mesh = part_meshes(family)[wrist].vertices
     turned = mesh + 2.0 * np.cross((x, y, z), np.cross((x, y, z), mesh) + w * mesh) + parts.at_m[0, wrist]
-    assert turned[:, 0].max() > 3.5 and turned[:, 2].max() > 0.5 + 0.75 * stature_m("e1")
+    assert turned[:, 0].max() > 3.5 and turned[:, 2].max() > 0.5 + 0.75 * stature_m("e1", Age.ADULT)
     assert sum(len(mesh) for mesh in part_meshes(family)) < 320
 
 

@@ -293,8 +293,8 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
     log = Log(
         tick_s=0.05,
         people_tick=np.ones(1, int),
-        people_event=np.ones(1, bool),
-        people_resident=np.ones(1, bool),
+        people_kind=np.ones(1, np.int8),
+        people_age=np.ones(1, np.int8),
         **arrays,
         **vectors,
     )  # type: ignore[arg-type]

@@ -37,8 +37,8 @@ def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
         tick_s=TICK_S, pose=pose, speed=np.zeros((n, 2)), command=np.zeros((n, 2)), route_s_m=x_m,
         travelled_m=travelled, person_m=np.ones(n), reset_s_m=np.full(n, np.nan), waits_at_red=np.zeros(n, bool),
         on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
-        people_tick=np.zeros(0, int), people_xy=np.zeros((0, 2)), people_event=np.zeros(0, bool),
-        people_resident=np.zeros(0, bool), event_tracks=tracks,
+        people_tick=np.zeros(0, int), people_xy=np.zeros((0, 2)), people_kind=np.zeros(0, np.int8),
+        people_age=np.zeros(0, np.int8), event_tracks=tracks,
     )  # fmt: skip
 
 

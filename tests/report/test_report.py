@@ -10,7 +10,7 @@ import pytest
 import shapely
 
 from cosim.core.geometry import Pose
-from cosim.core.state import People, RobotState, Street
+from cosim.core.state import People, PersonKind, RobotState, Street
 from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import EVENT, PERSON, ROUTE, Sheet
 from cosim.report.hud import Layout
@@ -97,7 +97,8 @@ def test_the_map_shows_who_is_where_and_faces_where() -> None:
     """East is right and north up; event people are orange, others violet, both with a nose; the hand that stops is red,
     between its person and the robot."""
     robot = RobotState(Pose(30.0, 0.0, 0.0))
-    people = People.of(("c1", "e0"), [[34.0, 5.0], [36.0, 0.0]], [0.5 * np.pi, np.pi], [1.2, 0.0], ("walk", "stop"))
+    xy, doing, kind = [[34.0, 5.0], [36.0, 0.0]], ("walk", "stop"), [PersonKind.CROWD, PersonKind.EVENT]
+    people = People.of(("u", "t"), xy, [0.5 * np.pi, np.pi], [1.2, 0.0], doing, kind=kind)  # type: ignore[arg-type]
     image = minimap().picture(robot, Street(0, people), (400, 400), np.array([1.0, 0.0]))
     px = 400 / (2.0 * MINIMAP_REACH_M)
     middle = 200.0 + px * (np.array([30.0, 0.0]) - (34.0, 0.0)) * (1.0, -1.0)
@@ -112,7 +113,7 @@ def test_the_map_shows_who_is_where_and_faces_where() -> None:
 def test_the_map_follows_its_robot() -> None:
     """The same street ten metres on: what stands on the ground moves by ten metres in the picture, to half a pixel."""
     one = minimap()
-    people = People.of(("e0",), [[36.0, 1.0]], [0.0], [0.0], ("stand",))
+    people = People.of(("e0",), [[36.0, 1.0]], [0.0], [0.0], ("stand",), kind=PersonKind.EVENT)
     east, shift = np.array([1.0, 0.0]), []
     for x in (30.0, 32.0):
         image = one.picture(RobotState(Pose(x, 0.0, 0.0)), Street(0, people), (300, 200), east)

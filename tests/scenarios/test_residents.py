@@ -6,6 +6,7 @@ import math
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -18,7 +19,7 @@ from shapely.geometry import LineString, Point
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
-from cosim.core.state import NOBODY, PERSON_RADIUS_M, People
+from cosim.core.state import NOBODY, PERSON_RADIUS_M, People, PersonKind
 from cosim.people.gait import Strides
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.events import EventQuery, EventReply
@@ -124,6 +125,8 @@ def lived(of: Town, seconds: float, seed: int = 7, count: int = 8, v_mps: float 
             [0.0, 0.0, *(a.speed_mps for a in actors)],
             ("stand", "stand", *(a.doing for a in actors)),
             pace=[0.0, 0.0, *(a.pace_mps for a in actors)],
+            kind=[0, 0, *(a.kind for a in actors)],
+            age=[0, 0, *(a.age for a in actors)],
         )
         moments.append(Moment(asked, shown, director.here))
     return moments
@@ -258,8 +261,8 @@ def test_who_sits_down_and_gets_up_does_not_jump() -> None:
     for moment in moments:
         row = np.array([i for i, who in enumerate(moment.people.ids) if who == name], dtype=np.intp)
         person = moment.people.only(row)
-        counted = strides.update(person.ids, person.xy, person.pace)
-        person = People.of(person.ids, person.xy, person.heading, person.speed, person.doing, *counted)
+        counted, pace = strides.update(person.ids, person.xy, person.pace, person.age.tolist())
+        person = replace(person, strides=counted, pace=pace)
         did |= set(person.doing)
         now = poses(person, moment.query.tick * TICK_MS / 1000, clips).matrices(clips)
         if before is not None and len(now) and len(before):
@@ -346,10 +349,11 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     names: set[str] = set()
 
     def watch(step: Step, verdict: Verdict) -> None:
-        names.update(name for name in step.street_after.people.ids if name.startswith("n"))
+        people = step.street_after.people
+        names.update(people.only(np.flatnonzero(people.are(PersonKind.RESIDENT))).ids)
 
     outcome = run_episode(scenario, load_policy("orca"), watches=[watch])
     assert outcome.log is not None and outcome.record.status == "done", outcome.record.reason
-    assert len(names) >= 6 and outcome.log.people_resident.any()
+    assert len(names) >= 6 and PersonKind.RESIDENT in outcome.log.people_kind
     state_hash, without = compared(Recorded(scenario, outcome.record, outcome.log))
     assert state_hash == outcome.record.state_hash and without.people.compared > 0

@@ -9,12 +9,12 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from cosim.core.state import NOBODY, People
+from cosim.core.state import NOBODY, People, PersonKind
 from cosim.people.neighbours import bystanders
 from cosim.spec.events import Bystander, Event, EventName, EventQuery, EventReply, EventState
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import react
-from scenarios.events.guest import arriving, guest_actor, guest_moved_on
+from scenarios.events.guest import Guest, arriving, guest_actor, guest_moved_on, shown_id
 
 TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
@@ -53,11 +53,19 @@ def drive(
     out = []
     for tick in range(ticks):
         t_s = tick * TICK_MS / 1000
-        here = tuple(Bystander(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps) for c in crowd)
+        here = tuple(
+            Bystander(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind) for c in crowd
+        )
         reply = react(asked(tick, start_m + speed_mps * t_s, speed_mps, here, (one,), *states))
         states = reply.states
         out.append((start_m + speed_mps * t_s, reply))
     return out
+
+
+def told(guest: Guest) -> Bystander:
+    """A guest as it sees others of its kind."""
+    one = guest.walker
+    return Bystander(shown_id(guest.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED)
 
 
 def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
@@ -137,7 +145,7 @@ def test_a_guest_goes_round_people_and_ends_beside_who_stands_at_its_end() -> No
     standing = (Bystander("c1", 5.0, 5.0, 0.0, 0.0), Bystander("c2", 10.0, 5.0, 0.0, 0.0))
     ways = []
     for tick in range(400):
-        me = Bystander("ei-anna", guest.walker.x_m, guest.walker.y_m, guest.walker.vx_mps, guest.walker.vy_mps)
+        me = told(guest)
         after = guest_moved_on(guest, asked(tick, 90.0, 0.0, (*standing, me)))
         assert after is not None
         guest = after
@@ -153,10 +161,7 @@ def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None
     path = ((0.0, 5.0), (10.0, 5.0))
     guests = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
     for tick in range(120):
-        seen = tuple(
-            Bystander(f"ei-{g.injection.id}", g.walker.x_m, g.walker.y_m, g.walker.vx_mps, g.walker.vy_mps)
-            for g in guests
-        )
+        seen = tuple(map(told, guests))
         after = [guest_moved_on(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
         guests = [guest for guest in after if guest is not None]
         places = [(g.walker.x_m, g.walker.y_m) for g in guests]
@@ -166,14 +171,14 @@ def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None
 
 def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
     """Of a crowd, one 3 m from an event pedestrian and a guest beside it; nobody while there is no event pedestrian."""
-    ids = ("c0", "c1", "e0", "e0-1", "ei-anna")
+    ids, kind = ("u", "s", "t", "a", "r"), [0, 0, PersonKind.EVENT, PersonKind.EVENT, PersonKind.INJECTED]
     xy = [(3.0, 0.0), (9.0, 0.0), (0.0, 0.0), (0.0, 1.0), (-2.0, 0.0)]
-    people = People.of(ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5)
-    told = bystanders(people, [event("conversing", people=2)])
-    assert [(b.id, b.x_m, b.y_m) for b in told] == [("c0", 3.0, 0.0), ("ei-anna", -2.0, 0.0)]
+    people = People.of(ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5, kind=kind)
+    told = bystanders(people)
+    assert [(b.id, b.x_m, b.y_m, b.kind) for b in told] == [("u", 3.0, 0.0, 0), ("r", -2.0, 0.0, PersonKind.INJECTED)]
     assert [(b.vx_mps, b.vy_mps) for b in told] == [pytest.approx((0.0, 1.0)), pytest.approx((0.0, 0.5))]
     crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
-    assert bystanders(crowd, [event("conversing")]) == bystanders(NOBODY, []) == ()
+    assert bystanders(crowd) == bystanders(NOBODY) == ()
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Polyline, boxes_overlap
-from cosim.core.state import Command, RobotState
+from cosim.core.state import Command, PersonKind, RobotState
 from cosim.episode.ports import Manifest, Observation
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
@@ -149,7 +149,15 @@ def test_vehicles_yield_on_a_crossing_without_signals(who: str) -> None:
     assert not street_map.strips[":n1x2_c1"].signalised
     middle = crossing.at(0.5 * crossing.length_m)
     here = np.array([0.35, 0.275])
-    guest = Actor(id="e0", x_m=middle.x_m, y_m=middle.y_m, heading_rad=middle.heading_rad, speed_mps=0.0, doing="stand")
+    guest = Actor(
+        id="e0",
+        x_m=middle.x_m,
+        y_m=middle.y_m,
+        heading_rad=middle.heading_rad,
+        speed_mps=0.0,
+        doing="stand",
+        kind=PersonKind.EVENT,
+    )
     over: set[str] = set()
     with SumoCrowd(net, street_map, CrowdSpec(persons=0, vehicles=40), 7, frozenset(), middle[:2]) as crowd:
         for tick in range(1200):

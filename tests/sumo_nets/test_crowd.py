@@ -13,7 +13,7 @@ from shapely.ops import substring
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Polyline, Pose
-from cosim.core.state import RobotState, Street
+from cosim.core.state import Age, PersonKind, RobotState, Street
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
@@ -42,6 +42,13 @@ def place() -> Place:
     net = city_net(City(seed=2, size_m=600.0))
     street_map = street_map_of(net)
     return Place(net, street_map, WalkGraph(street_map))
+
+
+def acting(name: str, x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> Actor:
+    """Somebody of an event who walks."""
+    return Actor(
+        id=name, x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_mps=speed_mps, doing="walk", kind=PersonKind.EVENT
+    )
 
 
 def reply(tick: int, *actors: Actor) -> EventReply:
@@ -83,9 +90,8 @@ def test_the_first_street_is_populated_and_clear_around_the_robot(place: Place) 
     assert street.tick == 0 and len(street.people) == 40
     assert gaps(street, start).min() >= 7.9 and gaps(street, start).max() <= 82.5
     assert {place.map.locate(*xy).kind for xy in street.people.xy} == {"walk"}
-    assert all(name.startswith("c") for name in street.people.ids) and list(street.people.ids) == sorted(
-        street.people.ids
-    )
+    assert street.people.are(PersonKind.CROWD).all() and {*street.people.age.tolist()} == {*Age}
+    assert list(street.people.ids) == sorted(street.people.ids)
     assert len(street.vehicles) >= 10 and street.vehicles.speed.max() > 5.0
     on_road = [bool(place.map.near("lane", shapely.Point(xy))) for xy in street.vehicles.xy]
     assert np.mean(on_road) > 0.9
@@ -256,27 +262,30 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
 
 
 def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> None:
-    """Actors are in the street as given, between the others in order of ids, gone when not given; people walk round."""
+    """Actors are in the street as given, behind the others in order of ids, gone when not given; people walk round."""
     start = middle(place)
     ahead = Pose(
         start.x_m + 6.0 * math.cos(start.heading_rad), start.y_m + 6.0 * math.sin(start.heading_rad), start.heading_rad
     )
-    talker = Actor(id="e2", x_m=ahead.x_m, y_m=ahead.y_m, heading_rad=1.0, speed_mps=0.0, doing="talk")
+    talker = Actor(
+        id="a2", x_m=ahead.x_m, y_m=ahead.y_m, heading_rad=1.0, speed_mps=0.0, doing="talk", kind=PersonKind.INJECTED,
+        age=Age.ELDERLY,
+    )  # fmt: skip
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest = math.inf
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
         for tick in range(1200):
-            walker = Actor(
-                id="e1", x_m=start.x_m + 0.01 * tick, y_m=start.y_m, heading_rad=0.0, speed_mps=0.2, doing="walk"
-            )
+            walker = acting("a1", start.x_m + 0.01 * tick, start.y_m, 0.0, 0.2)
             street = crowd.step(at(start), reply(tick, talker, walker))
             people = street.people
-            assert list(people.ids) == sorted(people.ids) and people.ids[-2:] == ("e1", "e2")
+            assert people.ids[-2:] == ("a1", "a2") and people.kind[-2:].tolist() == [walker.kind, talker.kind]
+            assert people.age[-2:].tolist() == [Age.ADULT, Age.ELDERLY]
+            assert not people.kind[:-2].any()
             assert people.xy[-2:].tolist() == [[walker.x_m, walker.y_m], [talker.x_m, talker.y_m]]
             assert people.heading[-1] == 1.0 and people.speed[-2] == 0.2 and people.doing[-2:] == ("walk", "talk")
             nearest = min(nearest, float(gaps(street, ahead)[:-2].min()))
         street = crowd.step(at(start), reply(1200))
-        assert not any(name.startswith("e") for name in street.people.ids)
+        assert street.people.are(PersonKind.CROWD).all()
     assert 0.45 <= nearest < 3.0
 
 
@@ -291,7 +300,7 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
             streets.append(crowd.street)
             for tick in range(ticks):
                 pose = Pose(start.x_m + 0.05 * tick * math.cos(start.heading_rad), start.y_m, start.heading_rad)
-                actor = Actor(id="e1", x_m=pose.x_m + 2.0, y_m=pose.y_m, heading_rad=0.0, speed_mps=1.0, doing="walk")
+                actor = acting("e1", pose.x_m + 2.0, pose.y_m, 0.0, 1.0)
                 streets.append(crowd.step(at(pose), reply(tick, actor)))
         return streets
 
@@ -327,10 +336,7 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
                     body[:] = somewhere()
                 body[0] += 0.06 * math.cos(body[2])
                 body[1] += 0.06 * math.sin(body[2])
-            actors = [
-                Actor(id=f"e{i}", x_m=x, y_m=y, heading_rad=heading, speed_mps=1.2, doing="walk")
-                for i, (x, y, heading) in enumerate(bodies[1:])
-            ]
+            actors = [acting(f"e{i}", x, y, heading, 1.2) for i, (x, y, heading) in enumerate(bodies[1:])]
             street = crowd.step(at(Pose(*bodies[0])), reply(tick, *actors))
         assert np.isfinite(street.people.xy).all() and np.isfinite(street.vehicles.xy).all()
 
@@ -350,7 +356,7 @@ def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
     spots = rng.uniform((-5, -5, -math.pi), (12, 12, math.pi), (2000, 2, 3)).tolist()
     with SumoCrowd(net, street_map, CrowdSpec(persons=4, vehicles=0), 9, OPEN, (0.0, 0.0)) as crowd:
         for tick, (robot, (x, y, heading)) in enumerate(spots):
-            actor = Actor(id="e0", x_m=x, y_m=y, heading_rad=heading, speed_mps=1.2, doing="walk")
+            actor = acting("e0", x, y, heading, 1.2)
             crowd.step(at(Pose(*robot)), reply(tick, actor))
         assert crowd.street.tick == 2000
 
@@ -380,12 +386,13 @@ def test_misuse_is_named(place: Place, tmp_path: Path) -> None:
     crowd = SumoCrowd(place.net, place.map, spec, 1, OPEN, start[:2])
     with pytest.raises(EngineError, match="not running: use it as a context manager"):
         crowd.step(at(start), reply(0))
-    nobody = Actor(id="x1", x_m=0.0, y_m=0.0, heading_rad=0.0, speed_mps=0.0, doing="stand")
+    nobody = acting("x1", 0.0, 0.0, 0.0, 0.0)
     with crowd:
         with pytest.raises(EngineError, match="only once per process"), SumoCrowd(*_arguments(crowd)):
             pass
-        with pytest.raises(EngineError, match="unique ids that start with 'e'"):
-            crowd.step(at(start), reply(0, nobody))
+        for bad in ((nobody, nobody), (acting(crowd.street.people.ids[0], 0.0, 0.0, 0.0, 0.0),)):
+            with pytest.raises(EngineError, match="unique ids, and none of the crowd's"):
+                crowd.step(at(start), reply(0, *bad))
     crowd.close()
     with pytest.raises(EngineError, match="no street net at"), SumoCrowd(tmp_path / "no.xml", *_arguments(crowd)[1:]):
         pass

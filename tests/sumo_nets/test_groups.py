@@ -12,8 +12,7 @@ import pytest
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import People, RobotState, Street
-from cosim.people.gait import age_of
+from cosim.core.state import Age, People, RobotState, Street
 from cosim.place.street_map import Strip
 from cosim.spec.events import EventReply
 from cosim.spec.scenario import City, CrowdSpec
@@ -80,27 +79,31 @@ def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
     persons = sum(company.size for company in drawn)
     ages = Counter(age for company in drawn for age in company.ages)
     assert sum(c.size for c in drawn if c.size > 1) / persons == pytest.approx(0.4, abs=0.02)
-    assert ages["elder"] / persons == pytest.approx(0.1, abs=0.015)
-    assert ages["child"] / persons == pytest.approx(0.15, abs=0.015)
+    assert ages[Age.ELDERLY] / persons == pytest.approx(0.1, abs=0.015)
+    assert ages[Age.CHILD] / persons == pytest.approx(0.15, abs=0.015)
     assert {company.size for company in drawn} == {1, 2, 3}
-    families = [company for company in drawn if "child" in company.ages]
-    assert all("adult" in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families)
-    assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {"adult"})
+    families = [company for company in drawn if Age.CHILD in company.ages]
+    assert all(Age.ADULT in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families)
+    assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {Age.ADULT})
 
 
-def test_without_groups_and_ages_nothing_is_drawn() -> None:
-    """A plain crowd takes no numbers from the generator, and everybody walks alone."""
+def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
+    """A plain crowd takes no numbers from the generator; everybody walks alone, and some look young or old."""
     rng = np.random.default_rng(1)
     companies = Companies(CrowdSpec(), rng)
-    for _ in range(10):
-        assert companies.coming == Company(("",))
+    ages: Counter[Age] = Counter()
+    for _ in range(2000):
+        (age,) = companies.coming.ages
+        assert companies.coming.pace_mps == PERSON_MPS
+        ages[age] += 1
         companies.entered()
+    assert [ages[age] / 2000 for age in Age] == pytest.approx([0.78, 0.10, 0.12], abs=0.03)
     assert rng.random() == np.random.default_rng(1).random()
 
 
 def test_a_group_walks_abreast_where_there_is_room() -> None:
     """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower than one."""
-    three = Company(("", "", ""))
+    three = Company((Age.ADULT,) * 3)
     assert np.array(three.places(1.92)) == pytest.approx(np.array([(-0.64, 0.0), (0.0, 0.0), (0.64, 0.0)]))
     assert np.array(three.places(1.3)) == pytest.approx(np.array([(-0.32, 0.0), (0.32, 0.0), (0.0, 0.8)]))
     assert np.array(three.places(0.64)) == pytest.approx(np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)]))
@@ -217,14 +220,17 @@ def test_groups_stay_together_on_the_street(tmp_path: Path) -> None:
     assert np.mean([inside(street).sum() for street in streets]) == pytest.approx(50, rel=0.05)
 
     ids = [name for street in streets[::100] for name in street.people.ids]
+    ages = {name: age for street in streets for name, age in zip(street.people.ids, street.people.age, strict=True)}
     together = {name for now in groups for names in now for name in names}
     assert np.mean([name in together for name in ids]) == pytest.approx(0.5, abs=0.15)
-    assert {age_of(name) for name in ids} == {"child", "adult", "elder"}
-    assert all(any(age_of(name) == "adult" for name in names) for names in groups[0] if "child" in map(age_of, names))
-    assert {name for name in ids if age_of(name) == "child"} <= together
-    walking = [(street.people.speed[i], age_of(n)) for street in streets[::20] for i, n in enumerate(street.people.ids)]
-    pace = {age: np.median([v for v, a in walking if a == age and v > 0.5]) for age in ("child", "elder", "adult")}
-    assert 0.75 < pace["child"] < 1.12 and 0.75 < pace["elder"] < 1.12 and pace["adult"] > 1.12
+    assert {ages[name] for name in ids} == {*Age}
+    families = [{ages[name] for name in names if name in ages} for names in groups[0]]
+    assert all(Age.ADULT in family for family in families if Age.CHILD in family)
+    assert {name for name in ids if ages[name] == Age.CHILD} <= together
+    walking = [(street.people.speed, street.people.age) for street in streets[::20]]
+    speed, age = (np.concatenate(column) for column in zip(*walking, strict=True))
+    pace = {one: np.median(speed[(age == one) & (speed > 0.5)]) for one in Age}
+    assert 0.75 < pace[Age.CHILD] < 1.12 and 0.75 < pace[Age.ELDERLY] < 1.12 and pace[Age.ADULT] > 1.12
 
     again, _ = run(200)
     for a, b in zip(streets, again, strict=False):

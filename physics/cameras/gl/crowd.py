@@ -33,6 +33,8 @@ _INSTANCE: Final = np.dtype([("person", "i4"), ("girth", "f4")])
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
 
+_NOBODY: Final[tuple[tuple[str, ...], bytes]] = ((), b"")
+
 _POSE_VERTEX: Final = """#version 430
 void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
 """
@@ -86,7 +88,7 @@ class CrowdDrawing:
         self._known = np.zeros(len(self._starts), dtype=bool)
         self._split = (0, 0, 0)
         self._room = 0
-        self._dyed_for: tuple[str, ...] = ()
+        self._dyed_for = _NOBODY
         self._grow(_CROWD_MIN)
 
     def set(
@@ -114,11 +116,12 @@ class CrowdDrawing:
         told[:, 0], told[:, 1] = posed.rows, posed.weights
         told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = people.xy - anchor, z_m, posed.scale
         told[:, 3, 0], told[:, 3, 1] = np.cos(people.heading), np.sin(people.heading)
-        outfit, girth, colours = _dressed(people.ids)
+        who = people.ids, people.age.tobytes()
+        outfit, girth, colours = _dressed(*who)
         self._told.write(told, viewport=(0, 0, 4, count))
-        if people.ids != self._dyed_for:
+        if who != self._dyed_for:
             self._dyed.write(colours, viewport=(0, 0, len(COATS), count))
-            self._dyed_for = people.ids
+            self._dyed_for = who
         self._set_draws(outfit, levels(people.xy, z_m, shot), seen, casts, girth)
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, count)
@@ -197,7 +200,7 @@ class CrowdDrawing:
     def _grow(self, room: int) -> None:
         """Make room for more people."""
         self._release_room()
-        self._room, self._dyed_for = room, ()
+        self._room, self._dyed_for = room, _NOBODY
         self._told = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
@@ -215,9 +218,9 @@ class CrowdDrawing:
 
 
 @lru_cache(maxsize=64)
-def _dressed(ids: tuple[str, ...]) -> tuple[NDArray[np.intp], NDArray[np.float32], bytes]:
+def _dressed(ids: tuple[str, ...], ages: bytes) -> tuple[NDArray[np.intp], NDArray[np.float32], bytes]:
     """(N,) outfits and girths of people, and their colours as they go up."""
-    looks = [look_of(name) for name in ids]
+    looks = list(map(look_of, ids, ages))
     girth = np.array([who.girth_m for who in looks], dtype=np.float32)
     return np.array([who.outfit for who in looks]), girth, np.stack([who.colours for who in looks]).tobytes()
 
