@@ -119,8 +119,10 @@ def run_command(
     from scenarios.builders.fits import LOOKING, check_places
     from scenarios.catalog import load_suite, scenarios_chosen, with_crowd
     from scenarios.execution.asked import Patience
+    from scenarios.execution.messages import Hello
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
+    from scenarios.execution.process import LocalProcesses
     from scenarios.execution.suite_run import run_spec
 
     if map_name is not None:
@@ -179,8 +181,8 @@ def run_command(
                 run_all(
                     held,
                     todo,
-                    policy,
-                    loaded,
+                    Hello(policy, manifest, loaded.source_hash),
+                    LocalProcesses(held.path / "logs"),
                     jobs=jobs,
                     tell=board.tell,
                     options=options,

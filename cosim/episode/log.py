@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import os
+import io
 import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
+from cosim.core.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -61,13 +62,14 @@ class Log:
 
     def save(self, path: Path) -> None:
         """Write as .npz, whole or not at all."""
-        temporary = path.with_name(path.name + ".part")
-        with temporary.open("wb") as file:
-            arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
-            np.savez_compressed(file, allow_pickle=False, **arrays)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        write_whole(path, self.encoded())
+
+    def encoded(self) -> bytes:
+        """The compressed .npz that is the file."""
+        file = io.BytesIO()
+        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+        return file.getvalue()
 
     @classmethod
     def load(cls, path: Path) -> Log:

@@ -7,7 +7,6 @@ bytes.
 from __future__ import annotations
 
 import hashlib
-import os
 from pathlib import Path
 from typing import Literal
 
@@ -17,6 +16,7 @@ import numpy as np
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 from cosim.core.versions import versions
+from cosim.core.whole_file import write_whole
 from cosim.episode.log import Log
 from cosim.episode.ports import Manifest
 from cosim.episode.step import Step
@@ -87,22 +87,29 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     def save(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""
-        temporary = path.with_name(path.name + ".part")
-        with temporary.open("wb") as file:
-            file.write(msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
+        write_whole(path, self.encoded())
+
+    def encoded(self) -> bytes:
+        """The JSON that is the file."""
+        return msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
 
     @classmethod
     def load(cls, path: Path) -> Record:
         """Read a record. Raises RunError naming the file and the field."""
         try:
-            record = msgspec.json.decode(path.read_bytes(), type=cls)
-        except (OSError, msgspec.DecodeError) as error:
+            return cls.decoded(path.read_bytes(), path)
+        except OSError as error:
             raise RunError(f"{path}: not an episode record: {error}") from error
+
+    @classmethod
+    def decoded(cls, data: bytes, where: Path) -> Record:
+        """The record in a file's bytes. where: what an error names. Raises RunError."""
+        try:
+            record = msgspec.json.decode(data, type=cls)
+        except msgspec.DecodeError as error:
+            raise RunError(f"{where}: not an episode record: {error}") from error
         if record.schema != _SCHEMA:
-            raise RunError(f"{path}: record schema {record.schema}; this version reads {_SCHEMA}")
+            raise RunError(f"{where}: record schema {record.schema}; this version reads {_SCHEMA}")
         return record
 
 

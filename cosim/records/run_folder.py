@@ -2,7 +2,7 @@
 
 run.json                         what is run: suite, policy, scenarios, versions, renderer
 scenarios.json                   the resolved specs
-episodes/<scenario>/record.json  and trajectory.npz, written by the worker, whole or not at all
+episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at all; frames/
 results.sqlite                   one row per finished episode, in the order in which they ended
 results.csv                      the same, sorted by scenario, written at the end
 logs/                            what the engines of each worker printed
@@ -14,6 +14,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import shutil
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
@@ -25,12 +26,14 @@ import msgspec
 import pandas as pd
 
 from cosim.core.errors import MachineError, RunError, unknown, unwritable
+from cosim.core.whole_file import write_whole
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
 from cosim.spec.scenario import Suite, write_suite
 
 DATABASE = "results.sqlite"
 REMEDY = "give the command of the run again with --resume, which makes it anew from the records on disk"
+_KEPT = "finished episodes are kept; make room and go on with --resume"
 DAMAGE = {
     sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_MISMATCH, sqlite3.SQLITE_SCHEMA,
 }  # fmt: skip
@@ -145,8 +148,29 @@ class RunFolder:
         except sqlite3.Error as error:
             raise _trouble(self.path, error) from error
 
-    def adopt(self, scenario_id: str) -> bool:
-        """Take in the record that a worker wrote for a scenario; False when there is none, or a damaged one."""
+    def keep(self, record: Record, log: bytes = b"") -> None:
+        """Write what came out of an episode, the record last, and add its row. log: the bytes of its `Log`."""
+        target = self.episode_folder(record.scenario)
+        try:
+            target.mkdir(parents=True, exist_ok=True)
+            if log:
+                write_whole(target / "trajectory.npz", log)
+            record.save(target / "record.json")
+        except OSError as error:
+            raise unwritable(target, error, _KEPT) from error
+        self.add(record)
+
+    def keep_frame(self, scenario_id: str, tick: int, png: bytes) -> None:
+        """Write a camera frame of an episode."""
+        frames = self.episode_folder(scenario_id) / "frames"
+        try:
+            frames.mkdir(parents=True, exist_ok=True)
+            (frames / f"{tick:06d}.png").write_bytes(png)
+        except OSError as error:
+            raise unwritable(frames, error, _KEPT) from error
+
+    def _adopt(self, scenario_id: str) -> bool:
+        """Take in the record of a scenario that has no row; False when there is none, or a damaged one."""
         path = self.episode_folder(scenario_id) / "record.json"
         if not path.exists():
             return False
@@ -164,6 +188,7 @@ class RunFolder:
     def forget(self, scenario_id: str) -> None:
         """Remove what an earlier attempt at a scenario has left."""
         path = self.episode_folder(scenario_id) / "record.json"
+        shutil.rmtree(path.with_name("frames"), ignore_errors=True)
         try:
             path.unlink(missing_ok=True)
         except OSError as error:
@@ -172,10 +197,8 @@ class RunFolder:
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""
         table = table_of(read_records(self.path))
-        temporary = self.path / "results.csv.part"
         try:
-            table.to_csv(temporary, index=False)
-            temporary.replace(self.path / "results.csv")
+            write_whole(self.path / "results.csv", table.to_csv(index=False).encode())
         except OSError as error:
             remedy = "all episodes are kept; make room and add --resume"
             raise unwritable(self.path / "results.csv", error, remedy) from error
@@ -189,9 +212,8 @@ class RunFolder:
             wanted = set(self.spec.scenarios)
             chosen = msgspec.structs.replace(suite, scenarios=tuple(s for s in suite.scenarios if s.id in wanted))
             write_suite(chosen, self.path / "scenarios.json")
-            temporary = self.path / "run.json.part"
-            temporary.write_bytes(msgspec.json.format(msgspec.json.encode(self.spec), indent=1) + b"\n")
-            temporary.replace(self.path / "run.json")
+            spec = msgspec.json.format(msgspec.json.encode(self.spec), indent=1)
+            write_whole(self.path / "run.json", spec + b"\n")
         except OSError as error:
             raise unwritable(self.path, error) from error
 
@@ -210,7 +232,7 @@ class RunFolder:
             _check(self.path)
         on_disk = {p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")}
         missing = sorted(set(self.spec.scenarios) & on_disk.keys() - self.finished(), key=on_disk.__getitem__)
-        taken = sum([self.adopt(scenario_id) for scenario_id in missing])
+        taken = sum([self._adopt(scenario_id) for scenario_id in missing])
         if mended:
             self.notes.append(
                 f"{database} was damaged ({mended}): made anew from {taken} records on disk, kept as {DATABASE}.damaged"

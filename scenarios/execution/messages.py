@@ -1,6 +1,8 @@
-"""What a run and its environment processes say to each other: MessagePack over a pipe."""
+"""What a run and its workers say to each other; between processes and machines as MessagePack."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import msgspec
 
@@ -11,7 +13,7 @@ from cosim.spec.scenario import Scenario
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
-    """The first message to an environment process: which policy it drives with, and what that was for the run."""
+    """The first message to a worker: which policy it drives with, and what that was for the run."""
 
     policy: str
     manifest: Manifest
@@ -19,10 +21,9 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this. folder: where record.json and trajectory.npz go."""
+    """Run this."""
 
     scenario: Scenario
-    folder: str
     options: EpisodeOptions = EpisodeOptions()
 
 
@@ -60,21 +61,25 @@ class Compares(msgspec.Struct, frozen=True, tag=True):
     share: float
 
 
+class FrameDrawn(msgspec.Struct, frozen=True, tag=True):
+    """A camera frame that is to be kept, as PNG."""
+
+    scenario: str
+    tick: int
+    png: bytes
+
+
 class Done(msgspec.Struct, frozen=True, tag=True):
-    """The episode is over and its record is on disk."""
+    """The episode is over. record, log: the bytes of its files, as `encoded` by Record and Log; a crash has no log."""
 
     scenario: str
     status: Status
+    record: bytes = b""
+    log: bytes = b""
 
 
-class Unsaved(msgspec.Struct, frozen=True, tag=True):
-    """The episode is over, but its record could not be written."""
-
-    scenario: str
-    reason: str
-
-
-Message = Ready | Unable | Progress | Waits | Compares | Done | Unsaved
+Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | Done
+Hear = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode
 decode_hello = msgspec.msgpack.Decoder(Hello).decode

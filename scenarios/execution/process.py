@@ -1,19 +1,24 @@
-"""One environment process as the run sees it: started, spoken with, ended with everything it has started."""
+"""The transport to environment processes of this machine: each is started, spoken with over a socket, and ended with
+everything that it has started."""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import subprocess
 import sys
-from collections.abc import Iterator
-from multiprocessing import Pipe
+from contextlib import suppress
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Final
 
+import msgspec
+
 from cosim.core.errors import unwritable
 from scenarios.execution.asked import Asked, Question
-from scenarios.execution.messages import Hello, Job, Message, decode_message, encode_message
+from scenarios.execution.messages import Hear, Hello, Job, decode_message, encode_message
+from scenarios.execution.wire import Wire
 
 ENDING_S: Final = 10.0
 """What a process is left to end by itself, and then its shepherd to clear up."""
@@ -23,15 +28,36 @@ _CODE: Final = (
 )
 
 
-class Process:
-    """A shepherd and its worker (`scenarios.execution.shepherd`). asked: what its policy is asked right now;
-    question: what it was asked when it ended."""
+class LocalProcesses:
+    """Workers that are processes of this machine. logs: the folder for what they print."""
+
+    def __init__(self, logs: Path) -> None:
+        self._logs = logs
+        self._started = 0
+        self._processes: list[_Process] = []
+
+    def start(self, hello: Hello) -> _Process:
+        process = _Process(self._logs / f"worker-{self._started}.log")
+        process.send(hello)
+        self._started += 1
+        self._processes.append(process)
+        return process
+
+    def wait(self, timeout_s: float) -> None:
+        self._processes = [process for process in self._processes if process.open]
+        wait([process.wire.fileno() for process in self._processes], timeout_s)
+
+
+class _Process:
+    """A shepherd and its worker (`scenarios.execution.shepherd`). open: it has not ended, as far as the run knows."""
 
     def __init__(self, log: Path) -> None:
-        self.log, self.asked = log, Asked.new()
-        self.question: Question | None = None
-        self.pipe, theirs = Pipe()
-        given = (theirs.fileno(), self.asked.descriptor)
+        self.log, self.open = str(log), True
+        self._asked = Asked.new()
+        self._last_asked: Question | None = None
+        ours, theirs = socket.socketpair()
+        self.wire = Wire(ours)
+        given = (theirs.fileno(), self._asked.descriptor)
         path = [str(Path(entry).absolute()) for entry in sys.path]
         code = _CODE.format(path=path, pipe=given[0], asked=given[1], run=os.getpid())
         try:
@@ -49,43 +75,46 @@ class Process:
         finally:
             theirs.close()
 
-    def send(self, message: Hello | Job) -> None:
-        """Say something. A process that died while it was idle does not hear it: its `messages` tell."""
-        try:
-            self.pipe.send_bytes(encode_message(message))
-        except (BrokenPipeError, ConnectionResetError):
-            return
+    @property
+    def question(self) -> Question | None:
+        return self._asked.question if self.open else self._last_asked
 
-    def messages(self) -> Iterator[Message | None]:
-        """What the process has said since; None at last if it says no more."""
+    def give(self, job: Job) -> None:
+        self.send(job)
+
+    def send(self, message: Hello | Job) -> None:
+        """Say something. A process that died or was stopped while it was idle does not hear it."""
+        with suppress(OSError):
+            self.wire.send(encode_message(message), within_s=ENDING_S)
+
+    def listen(self, hear: Hear) -> bool:
         try:
-            while self.pipe.poll():
-                yield decode_message(self.pipe.recv_bytes())
-        except (EOFError, ConnectionResetError):
-            yield None
+            for message in self.wire.received():
+                hear(decode_message(message))
+        except (EOFError, msgspec.DecodeError):  # a policy can write to the socket, too
+            return False
+        return True
 
     def hang_up(self) -> None:
-        """Close the pipe: an idle process ends then."""
-        self.pipe.close()
+        self.wire.close()
 
     def kill(self, *, wait: bool = True) -> None:
-        """End it by force, with all its children."""
         self._child.send_signal(signal.SIGTERM)
         if wait:
             self.end()
 
     def end(self) -> str:
-        """Wait until it has ended, by force if need be. Returns how it ended, in words."""
-        self.pipe.close()
+        self.wire.close()
         code = self._code(ENDING_S)
         if code is None:
             self._child.send_signal(signal.SIGTERM)
             if self._code(2 * ENDING_S) is None:
                 self._child.kill()
                 self._child.wait()
-        self.question = self.asked.question
-        self.asked.close()
-        during = f" in the policy's {self.question.when}" if self.question is not None else ""
+        if self.open:
+            self._last_asked, self.open = self._asked.question, False
+            self._asked.close()
+        during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
         return f"the environment process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:

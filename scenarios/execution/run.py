@@ -5,7 +5,6 @@ from __future__ import annotations
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import msgspec
 
@@ -63,14 +62,6 @@ def run_episode(
             trouble = traceback.format_exc()
             record = msgspec.structs.replace(record, reason=f"the street without the robot: {in_words(error)}")
     return Outcome(record, log, trouble)
-
-
-def keep(outcome: Outcome, folder: Path) -> None:
-    """Write what came out of an episode into its folder, the record last. Raises OSError."""
-    folder.mkdir(parents=True, exist_ok=True)
-    if outcome.log is not None:
-        outcome.log.save(folder / "trajectory.npz")
-    outcome.record.save(folder / "record.json")
 
 
 def drive(episode: Episode, policy: Policy) -> None:

@@ -35,7 +35,7 @@ KILLING_S = 10.0
 def keep_worker(pipe: int, asked: int, parent: int) -> None:
     """Run one worker and end as it ended.
 
-    pipe, asked: descriptors of its connection to the run and of `scenarios.execution.asked`. parent: process id of the
+    pipe, asked: descriptors of its socket to the run and of `scenarios.execution.asked`. parent: process id of the
     run. What the worker prints goes to this process's standard output."""
     end_with(parent, signal.SIGTERM)
     _prctl(PR_SET_CHILD_SUBREAPER, 1)

@@ -10,7 +10,7 @@ from pathlib import Path
 import msgspec
 import pandas as pd
 
-from cosim.core.errors import UsageError, unwritable
+from cosim.core.errors import UsageError
 from cosim.core.versions import versions
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Policy
@@ -23,8 +23,10 @@ from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from scenarios.builders.fits import check_places
 from scenarios.catalog import load_suite, scenarios_chosen
-from scenarios.execution.asked import Patience
+from scenarios.execution.messages import Hello
 from scenarios.execution.pool import run_all
+from scenarios.execution.process import LocalProcesses
+from scenarios.execution.transport import InProcess, Transport
 
 
 def run(
@@ -72,23 +74,12 @@ def run(
         done = held.finished()
         todo = [scenario for scenario in picked if scenario.id not in done]
         if isinstance(policy, str):
-            run_all(held, todo, policy, driver, jobs=jobs, tell=_untold, options=options, patience=Patience())
+            transport: Transport = LocalProcesses(held.path / "logs")
         else:
-            run_here(held, todo, driver, options)
+            transport = InProcess(driver)
+        hello = Hello(name, driver.manifest, driver.source_hash)
+        run_all(held, todo, hello, transport, jobs=jobs, tell=_untold, options=options)
         return held.finish()
-
-
-def run_here(held: RunFolder, todo: Sequence[Scenario], driver: Driver, options: EpisodeOptions) -> None:
-    """Run scenarios one after another in this process, adding each record to the folder as it ends."""
-    from scenarios.execution.run import keep, run_episode  # the engines, which a run in processes does without
-
-    for scenario in todo:
-        target = held.episode_folder(scenario.id)
-        try:
-            keep(run_episode(scenario, driver, options), target)
-        except OSError as error:
-            raise unwritable(target, error) from error
-        held.adopt(scenario.id)
 
 
 def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions) -> RunSpec:

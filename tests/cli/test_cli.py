@@ -17,6 +17,7 @@ import msgspec
 import pandas as pd
 import pytest
 
+from cosim.core.whole_file import write_whole
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from tests.conftest import PATIENCE_S, WIDE, Cosim
@@ -48,25 +49,19 @@ class Held(Base):
         while hold.exists():
             time.sleep(0.02)
 class DiesLate(Base):
-    # takes its process down right after the record of t-1 is on the disk
+    # takes its process down right after the record of t-1 is sent, and once in the middle of that of t-2
     def act(self, observation):
-        from cosim.records.record import Record
-        save = Record.save
-        def dying(record, path):
-            save(record, path)
-            if record.scenario == "t-1": os.kill(os.getpid(), signal.SIGKILL)
-        if self.count == 0: Record.save = dying
-        self.count += 1
-        return Command(1.0, 0.0)
-class DiskFull(Base):
-    # the disk is full when the trajectory of t-1 is written
-    def act(self, observation):
-        from cosim.records.record import Log
-        save = Log.save
-        def failing(log, path):
-            if path.parent.name == "t-1": raise OSError(28, "No space left on device")
-            save(log, path)
-        if self.count == 0: Log.save = failing
+        from scenarios.execution.wire import Wire
+        send = Wire.send
+        def dying(wire, message, within_s=None):
+            done = b"Done" in message[:20] and len(message) > 2000
+            if done and b"t-2" in message[:50] and not Path("half").exists():
+                Path("half").touch()
+                wire._end.sendall(len(message).to_bytes(4, "big") + message[: len(message) // 2])
+                os.kill(os.getpid(), signal.SIGKILL)
+            send(wire, message, within_s)
+            if done and b"t-1" in message[:50]: os.kill(os.getpid(), signal.SIGKILL)
+        if send.__name__ == "send": Wire.send = dying
         self.count += 1
         return Command(1.0, 0.0)
 class Unfinished: pass
@@ -238,17 +233,27 @@ def children(pid: int) -> list[int]:
 
 
 def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: Cosim) -> None:
-    """A process that dies after writing its record has finished the episode: it is neither run again nor crashed."""
+    """A process that dies after sending its record has finished the episode: it is neither run again nor crashed. One
+    that dies while it sends has not: half a record is none, and the episode is run again."""
     out = desk / "late"
     run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--out", out.name, cwd=desk)
     assert run.returncode == 0, run.stdout
-    assert list(rows(out)["status"]) == ["done", "done", "done"]
+    assert list(rows(out)["status"]) == ["done", "done", "done"] and (desk / "half").exists()
+    assert sorted(p.name for p in out.glob("logs/*")) == ["worker-0.log", "worker-1.log", "worker-2.log"]
 
 
-def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim) -> None:
+def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
     """When a record cannot be written the run stops, says why, and keeps what is finished."""
+    from cosim.records import run_folder
+
+    def full(path: Path, data: bytes) -> None:
+        if path.parent.name == "t-1":
+            raise OSError(28, "No space left on device")
+        write_whole(path, data)
+
     out = desk / "full"
-    run = cosim("run", "tiny.json", "--policy", "mine:DiskFull", "--out", out.name, cwd=desk)
+    monkeypatch.setattr(run_folder, "write_whole", full)
+    run = cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", out.name, cwd=desk)
     assert run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
     assert "Traceback" not in run.stderr
     assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"

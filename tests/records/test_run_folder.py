@@ -163,10 +163,8 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
     """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every record on disk."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in (2, 0):
-            folder.episode_folder(f"s-{i}").mkdir()
-            record(f"s-{i}").save(folder.episode_folder(f"s-{i}") / "record.json")
+            folder.keep(record(f"s-{i}"))
             os.utime(folder.episode_folder(f"s-{i}") / "record.json", (0, 10 - i))
-            folder.adopt(f"s-{i}")
     DAMAGES[name](tmp_path / "run/results.sqlite")
     with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"):
         read_records(tmp_path / "run")
@@ -186,8 +184,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
             "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
             "from test_run_folder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, SUITE).__enter__();"
             "keep = sqlite3.connect(held.path / 'results.sqlite'); keep.execute('select * from episodes').fetchall();"
-            "held.episode_folder('s-1').mkdir(); record('s-1').save(held.episode_folder('s-1') / 'record.json');"
-            "held.adopt('s-1'); os.kill(os.getpid(), 9)"
+            "held.keep(record('s-1')); os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run([sys.executable, "-c", code, str(path), str(Path(__file__).parent)], check=False)
         assert killed.returncode == -9 and (path / "results.sqlite-wal").stat().st_size > 0
@@ -200,15 +197,13 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
 def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Path) -> None:
     """Deleted or overwritten while it is in use: wrong from then on, and whole again after --resume."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
-        folder.episode_folder("s-0").mkdir()
-        record("s-0").save(folder.episode_folder("s-0") / "record.json")
         (tmp_path / "run/results.sqlite").write_bytes(b"no database" * 1000)
         with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.adopt("s-0")
+            folder.keep(record("s-0"))
         for path in (tmp_path / "run").glob("results.sqlite*"):
             path.unlink()
         with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.adopt("s-0")
+            folder.keep(record("s-0"))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished() == {"s-0"}
 

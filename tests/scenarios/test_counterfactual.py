@@ -21,9 +21,10 @@ from cosim.spec.events import EventReply
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.builders.crossings import build_all
-from scenarios.execution.messages import Compares, Done, Message, Progress
+from scenarios.execution.messages import Compares, Done, Hello, Message, Progress
 from scenarios.execution.places import place
 from scenarios.execution.pool import run_all
+from scenarios.execution.process import LocalProcesses
 from scenarios.execution.run import run_episode
 from scenarios.execution.wiring import crowd_of
 from sumo_nets.crowd.demand_log import Entrances
@@ -127,7 +128,8 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     told: list[Message] = []
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
         options = EpisodeOptions(camera="bullet", counterfactual=True)
-        run_all(folder, short.scenarios, "orca", driver, jobs=1, tell=told.append, options=options)
+        hello, transport = Hello("orca", manifest, driver.source_hash), LocalProcesses(folder.path / "logs")
+        run_all(folder, short.scenarios, hello, transport, jobs=1, tell=told.append, options=options)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
 

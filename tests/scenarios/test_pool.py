@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 import os
+import select
+import socket
+import struct
+import threading
 import time
-from collections.abc import Iterator
-from multiprocessing import Pipe
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from cosim.core.errors import MachineError
 from cosim.episode.driver import PolicyCall
 from cosim.policies.load import load_policy
-from cosim.records.record import Record
+from cosim.records.record import Record, begun
 from cosim.records.run_folder import RunFolder, RunSpec, read_records
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.execution import pool
-from scenarios.execution.asked import Asked, Patience
-from scenarios.execution.messages import Done, Hello, Job, Message, Ready
+from scenarios.execution.asked import Asked, Patience, Question
+from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Message, Ready
 from scenarios.execution.shepherd import BoundedLog
+from scenarios.execution.wire import Wire
 from tests.conftest import Cosim
 
 MODULES = {
@@ -141,34 +145,44 @@ def test_a_first_answer_may_take_longer(doing: PolicyCall, answer_s: float, star
 
 
 class Fake:
-    """An environment process that says what a test has prepared, and then nothing; or it ends."""
+    """A worker that says what a test has prepared, and then nothing; or it ends."""
+
+    log = "worker-0.log"
 
     def __init__(self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False) -> None:
-        self.pipe, self.theirs = Pipe()
-        self.asked, self.question = Asked.new(), None
-        self.log = Path("worker-0.log")
-        self.killed = False
-        if asks is not None:
-            self.asked.starts(asks, 64)
-        self._messages: list[Message | None] = [*messages, *([None] if ends else [])]
+        self.question = None if asks is None else Question(time.monotonic(), asks, 64)
+        self.killed, self._messages, self._ends = False, messages, ends
 
-    def send(self, message: Hello | Job) -> None:
+    def give(self, job: Job) -> None:
         """It does not listen."""
 
-    def messages(self) -> Iterator[Message | None]:
-        while self._messages:
-            yield self._messages.pop(0)
+    def listen(self, hear: Hear) -> bool:
+        messages, self._messages = self._messages, ()
+        for message in messages:
+            hear(message)
+        return not self._ends
 
     def hang_up(self) -> None:
-        self.pipe.close()
+        """It does not mind."""
 
     def kill(self, *, wait: bool = True) -> None:
         self.killed = True
-        self.question = self.asked.question
 
     def end(self) -> str:
-        self.question = self.asked.question
         return "the environment process ended with exit code 7"
+
+
+class Prepared:
+    """A transport to workers that a test has made."""
+
+    def __init__(self, *fakes: Fake) -> None:
+        self.waiting = iter(fakes)
+
+    def start(self, hello: Hello) -> Fake:
+        return next(self.waiting)
+
+    def wait(self, timeout_s: float) -> None:
+        """They have said everything."""
 
 
 SCENARIO = Scenario(
@@ -177,20 +191,22 @@ SCENARIO = Scenario(
 )  # fmt: skip
 
 
-def pooled(monkeypatch: pytest.MonkeyPatch, folder: Path, *fakes: Fake, **named: float) -> Record:
-    """The record of one scenario, run by these processes, one after the other."""
-    waiting = iter(fakes)
-    monkeypatch.setattr(pool, "Process", lambda log: next(waiting))
-    monkeypatch.setattr(pool, "POLL_S", 0.0)
-    suite, driver = Suite(name="s", version="1", scenarios=(SCENARIO,)), load_policy("stop")
+def pooled(folder: Path, *fakes: Fake, **named: float) -> Record:
+    """The record of one scenario, run by these workers, one after the other."""
+    transport, suite, driver = (
+        Prepared(*fakes),
+        Suite(name="s", version="1", scenarios=(SCENARIO,)),
+        load_policy("stop"),
+    )
     spec = RunSpec(
         suite="s", suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
         scenarios=("s-0",), versions={},
     )  # fmt: skip
+    hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
         patience = Patience(**named)
-        pool.run_all(held, suite.scenarios, "stop", driver, jobs=1, tell=lambda _: None, patience=patience)
-        assert next(waiting, None) is None and held.finished() == {"s-0"}
+        pool.run_all(held, suite.scenarios, hello, transport, jobs=1, tell=lambda _: None, patience=patience)
+        assert next(transport.waiting, None) is None and held.finished() == {"s-0"}
     (record,) = read_records(folder / "run")
     return record
 
@@ -199,14 +215,14 @@ def test_an_engine_that_hangs_is_tried_again(monkeypatch: pytest.MonkeyPatch, tm
     """A process that says nothing, while its policy has nothing to answer, is killed; the second time it is a crash."""
     monkeypatch.setattr(pool, "SILENCE_S", 0.0)
     fakes = (Fake(Ready()), Fake(Ready()))
-    record = pooled(monkeypatch, tmp_path, *fakes)
+    record = pooled(tmp_path, *fakes)
     assert record.reason.startswith("the environment process showed no sign of life, 2 times") and record.ticks == 0
     assert all(fake.killed for fake in fakes)
 
 
-def test_a_policy_that_hangs_is_not_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_policy_that_hangs_is_not_tried_again(tmp_path: Path) -> None:
     """It is told once, with the policy, the time, and where."""
-    record = pooled(monkeypatch, tmp_path, Fake(Ready(), asks="act"), answer_s=0.0)
+    record = pooled(tmp_path, Fake(Ready(), asks="act"), answer_s=0.0)
     assert record.reason == "policy 'stop' gave no answer for 0 s in act at 3.20 s of s-0"
 
 
@@ -215,17 +231,54 @@ def test_a_slow_policy_is_no_silence(monkeypatch: pytest.MonkeyPatch, tmp_path: 
     monkeypatch.setattr(pool, "SILENCE_S", 0.0)
     slow = Fake(Ready(), asks="act")
     began = time.monotonic()
-    record = pooled(monkeypatch, tmp_path, slow, answer_s=0.2)
+    record = pooled(tmp_path, slow, answer_s=0.2)
     assert time.monotonic() - began > 0.2 and "gave no answer for 0.2 s" in record.reason
 
 
-def test_a_record_that_is_gone_is_a_crash(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """A process that reports an episode as done, of which there is no record, has not finished it."""
-    record = pooled(monkeypatch, tmp_path, Fake(Ready(), Done("s-0", "done")))
-    assert record.status == "crashed" and record.reason.startswith("its record was gone or damaged")
+@pytest.mark.parametrize("came", ["half", "another"])
+def test_a_damaged_record_is_a_crash(tmp_path: Path, came: str) -> None:
+    """A worker that reports an episode as done with half a record, or another one's, has not finished it."""
+    other = msgspec.structs.replace(SCENARIO, id="s-1")
+    whole = begun(other, load_policy("stop").manifest, "h").encoded()
+    done = Done("s-0", "done", whole[: len(whole) // 2] if came == "half" else whole)
+    record = pooled(tmp_path, Fake(Ready(), done))
+    assert record.status == "crashed" and record.reason == "its record was damaged when it arrived"
 
 
-def test_processes_that_never_come_up_end_the_run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
+    """A worker needs no folder: the run's own process writes the bytes, and a frame."""
+    data = begun(SCENARIO, load_policy("stop").manifest, "h").encoded()
+    log = os.urandom(3_000_000)
+    record = pooled(tmp_path, Fake(Ready(), FrameDrawn("s-0", 5, b"png"), Done("s-0", "crashed", data, log)))
+    folder = tmp_path / "run" / "episodes" / "s-0"
+    assert (folder / "trajectory.npz").read_bytes() == log and (folder / "record.json").read_bytes() == data
+    assert (folder / "frames" / "000005.png").read_bytes() == b"png" and record.encoded() == data
+    assert not list((tmp_path / "run").rglob("*.part"))
+
+
+def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:
     """Twice in a row: the machine's fault, told with the log."""
     with pytest.raises(MachineError, match=r"ended with exit code 7 before it was ready, 2 times: see worker-0\.log"):
-        pooled(monkeypatch, tmp_path, Fake(ends=True), Fake(ends=True))
+        pooled(tmp_path, Fake(ends=True), Fake(ends=True))
+
+
+def test_half_a_message_keeps_nobody_waiting() -> None:
+    """Who is stopped in the middle of a message of megabytes is not waited for: what came whole is told, the rest when
+    it comes, and the end after all of it."""
+    ours, theirs = socket.socketpair()
+    wire, message = Wire(ours), os.urandom(3_000_000)
+    framed = struct.pack("!I", len(message)) + message
+    assert list(wire.received()) == []
+    heard: list[bytes] = []
+    for part in (framed[:2], framed[2:1000], framed[1000:] + framed[:5000], framed[5000:]):
+        sender = threading.Thread(target=theirs.sendall, args=(part,))
+        sender.start()
+        while sender.is_alive() or select.select([ours], [], [], 0.0)[0]:
+            heard += wire.received()
+    assert heard == [message, message]
+    theirs.sendall(framed[:10])
+    theirs.close()
+    with pytest.raises(EOFError):
+        heard += wire.received()
+    assert len(heard) == 2
+    wire.close()

@@ -1,0 +1,98 @@
+"""Transport: how jobs reach the workers that run episodes, and how what those say comes back.
+
+A transport carries, and nothing else: what a run does when a worker dies, falls silent or reports a damaged record
+stands above it, in `scenarios.execution.pool`, and is the same for all of them. A record and its log travel as bytes,
+so that a worker needs no folder of the run's.
+"""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+from cosim.episode.driver import Driver
+from scenarios.execution.asked import Question
+from scenarios.execution.messages import Hear, Hello, Job
+from scenarios.execution.worker import run_job
+
+
+class Worker(Protocol):
+    """Runs episodes, one at a time, with the policy of its Hello."""
+
+    @property
+    def log(self) -> str:
+        """Where one can read what it has printed."""
+
+    @property
+    def question(self) -> Question | None:
+        """What its policy is asked right now, or was asked when it ended; None where nothing can be known."""
+
+    def give(self, job: Job) -> None:
+        """Hand it a job. One that has died does not hear it: the next `listen` tells."""
+
+    def listen(self, hear: Hear) -> bool:
+        """Tell what it has said since, whole messages in their order, without waiting for more; False when it has
+        ended and nothing more will come."""
+
+    def hang_up(self) -> None:
+        """It gets no more jobs, and ends when it has none."""
+
+    def kill(self, *, wait: bool = True) -> None:
+        """End it by force, with everything that it has started."""
+
+    def end(self) -> str:
+        """Wait until it has ended, by force if need be. Returns how it ended, in words."""
+
+
+class Transport(Protocol):
+    """Starts workers. A worker tells that it is `Ready` or `Unable` before it says anything else."""
+
+    def start(self, hello: Hello) -> Worker:
+        """One more worker. Raises MachineError when there can be none."""
+
+    def wait(self, timeout_s: float) -> None:
+        """Until a worker that has not ended may have something to tell, or the time is over."""
+
+
+class InProcess:
+    """Episodes run in this process, one after another, while they are listened to, by a policy that was loaded here.
+
+    One that hangs or dies takes the run with it: no time limit of an answer can be kept.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+
+    def start(self, hello: Hello) -> _Here:
+        return _Here(self._driver)
+
+    def wait(self, timeout_s: float) -> None:
+        """Nothing: who listens has the next job done."""
+
+
+class _Here:
+    """A worker that works when it is listened to."""
+
+    log = "this process's own output"
+    question: Question | None = None
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._job: Job | None = None
+
+    def give(self, job: Job) -> None:
+        self._job = job
+
+    def listen(self, hear: Hear) -> bool:
+        job, self._job = self._job, None
+        if job is not None:
+            hear(run_job(job, self._driver, hear)[0])
+        return True
+
+    def hang_up(self) -> None:
+        """It has nothing that would have to end."""
+
+    def kill(self, *, wait: bool = True) -> None:
+        """Nobody who could is left while it works."""
+
+    def end(self) -> str:
+        return "this process goes on"

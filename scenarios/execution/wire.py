@@ -1,0 +1,73 @@
+"""Wire: whole messages over a socket between two processes of a machine."""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Iterator
+from typing import Final
+
+_LENGTH: Final = struct.Struct("!I")
+_CHUNK_BYTES: Final = 1 << 20
+_MOST_BYTES: Final = 1 << 30
+"""A message that says it is longer is none: a policy has written to its process's socket."""
+
+
+class Wire:
+    """One end. Each message has its length before it.
+
+    Nothing here waits for the rest of a message unless it is told to: who sends one may be stopped in the middle of it.
+    """
+
+    def __init__(self, end: socket.socket) -> None:
+        self._end, self._held = end, bytearray()
+
+    def fileno(self) -> int:
+        return self._end.fileno()
+
+    def send(self, message: bytes, within_s: float | None = None) -> None:
+        """Send a message; waits for room, up to within_s seconds. Raises OSError when the other end is gone."""
+        self._end.settimeout(within_s)
+        self._end.sendall(_LENGTH.pack(len(message)) + message)
+
+    def receive(self) -> bytes:
+        """The next message, waited for. Raises EOFError when none will come."""
+        self._end.settimeout(None)
+        while (message := self._next()) is None:
+            self._take()
+        return message
+
+    def received(self) -> Iterator[bytes]:
+        """The messages that have come. Raises EOFError, after the last of them, when no more will."""
+        self._end.setblocking(False)
+        try:
+            while True:
+                while (message := self._next()) is not None:
+                    yield message
+                self._take()
+        except BlockingIOError:
+            return
+
+    def close(self) -> None:
+        self._end.close()
+
+    def _take(self) -> None:
+        try:
+            chunk = self._end.recv(_CHUNK_BYTES)
+        except ConnectionResetError:
+            chunk = b""
+        if not chunk:
+            raise EOFError
+        self._held += chunk
+
+    def _next(self) -> bytes | None:
+        if len(self._held) < _LENGTH.size:
+            return None
+        end = _LENGTH.size + int(_LENGTH.unpack_from(self._held)[0])
+        if end > _MOST_BYTES:
+            raise EOFError
+        if len(self._held) < end:
+            return None
+        message = bytes(self._held[_LENGTH.size : end])
+        del self._held[:end]
+        return message

@@ -1,0 +1,54 @@
+"""Transports: whatever carries jobs and results, the results are the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+import cosim
+from cosim.core.state import Command
+from cosim.episode.log import Log
+from cosim.episode.ports import CameraSpec, Manifest
+from cosim.records.run_folder import read_records
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Suite
+from scenarios.checks import small_scenario
+from scenarios.execution import suite_run
+from scenarios.execution.process import LocalProcesses
+from scenarios.execution.transport import InProcess
+
+
+class Ahead:
+    """Drives straight on, and sees where it goes."""
+
+    manifest = Manifest("ahead", rate_hz=4.0, camera=CameraSpec(32, 24))
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: object) -> Command:
+        return Command(0.8, 0.0)
+
+
+@pytest.mark.engine
+def test_a_suite_has_the_same_results_over_every_transport(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In this process and in one of its own: the same state hashes, the same tables to the byte, the same logs and
+    camera frames; a policy object runs in this process, a named one in processes."""
+    used = []
+    for kind in (InProcess, LocalProcesses):
+        monkeypatch.setattr(suite_run, kind.__name__, lambda of, kind=kind: (used.append(kind), kind(of))[1])
+    one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
+    suite = Suite(name="two", version="1", scenarios=(one, msgspec.structs.replace(one, id="other", seed=5)))
+    options = EpisodeOptions(camera="bullet", frames_every_s=0.5)
+    cosim.run(suite, Ahead(), out=tmp_path / "here", options=options)
+    cosim.run(suite, f"{__name__}:Ahead", out=tmp_path / "there", options=options)
+    assert used == [InProcess, LocalProcesses]
+    assert len({(tmp_path / name / "results.csv").read_bytes() for name in ("here", "there")}) == 1
+    hashes = [[record.state_hash for record in read_records(tmp_path / name)] for name in ("here", "there")]
+    assert hashes[0] == hashes[1] and len(set(hashes[0])) == 2
+    files = [sorted(p for p in tmp_path.glob(f"{name}/episodes/*/frames/*.png")) for name in ("here", "there")]
+    assert [p.read_bytes() for p in files[0]] == [p.read_bytes() for p in files[1]] and len(files[0]) == 4
+    logs = [Log.load(tmp_path / name / "episodes" / "other" / "trajectory.npz") for name in ("here", "there")]
+    assert logs[0].pose.tobytes() == logs[1].pose.tobytes() and len(logs[0]) == 20
