@@ -136,12 +136,11 @@ class BulletCanvas:
 
     def _shape_of_file(self, mesh: Mesh, folder: Path) -> int:
         """The EGL plugin draws meshes from files alone."""
+        from trimesh import Trimesh  # only this renderer pays for its import
+
         path = folder / f"{len(list(folder.iterdir()))}.obj"
-        corners = mesh.triangles + 1
-        lines = [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in mesh.vertices.tolist()]
-        lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in mesh.normals.tolist()]
-        lines += [f"f {a}//{a} {b}//{b} {c}//{c}" for a, b, c in corners.tolist()]
-        path.write_text("\n".join(lines) + "\n")
+        drawn = Trimesh(mesh.vertices, mesh.triangles, vertex_normals=mesh.normals, process=False)
+        drawn.export(path, include_normals=True)
         shape: int = p.createVisualShape(p.GEOM_MESH, fileName=str(path), physicsClientId=self._client)
         return shape
 

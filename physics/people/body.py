@@ -18,6 +18,7 @@ from physics.people.head import about_head, neck_and_head
 from physics.people.lofts import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
 from physics.people.wear import Carried, Hair, carried, hair, headgear
+from physics.world.mesh import smooth_normals
 
 COATS: Final = ("skin", "lips", "hair", "white", "dark", "top", "bottom", "shoes", "bag", "cap")
 """What a vertex is painted as; a person has one colour for each."""
@@ -144,16 +145,6 @@ def strongest(weights: Floats) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
     order = np.argsort(-weights, axis=1, kind="stable")[:, :4]
     few = np.take_along_axis(weights, order, axis=1)
     return order.astype(np.uint8), (few / few.sum(axis=1, keepdims=True)).astype(np.float32)
-
-
-def smooth_normals(vertices: Floats, triangles: NDArray[np.int32]) -> Floats:
-    """(V, 3) unit normals: means of the triangles around, by area."""
-    a, b, c = (vertices[triangles[:, k]] for k in range(3))
-    face = np.cross(b - a, c - a)
-    total = np.zeros_like(vertices)
-    for axis in range(3):
-        total[:, axis] = np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(vertices))
-    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
 
 
 def _sided(vertices: Floats, weights: Floats) -> Floats:

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats
-from physics.people.body import COATS, SkinnedBody, smooth_normals, strongest
+from physics.people.body import COATS, SkinnedBody, strongest
 from physics.people.captures import Capture
 from physics.people.skeleton import INDEX, JOINTS, PARENTS, Skeleton, forward, rodrigues
+from physics.world.mesh import smooth_normals
 
 BYTES_MAX: Final = 512 * 2**20
 """The largest file that is read, unpacked; SMPL's own is 40 MB."""

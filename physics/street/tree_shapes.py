@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats
-from physics.world.mesh import Ints, Mesh, join
+from physics.world.mesh import Ints, Mesh, join, smooth_normals
 
 _SIDES: Final = 13
 _ROWS: Final = 8
@@ -76,7 +76,7 @@ def crown(species: Species, height_m: float) -> Crown:
     near = np.maximum.reduceat(reach[_neighbours(triangles, len(rays))[0]], _neighbours(triangles, len(rays))[1])
     crease = np.clip((reach / near - 0.66) / 0.34, 0.0, 1.0)
     shade = (0.50 + 0.50 * up**0.8) * (0.55 + 0.45 * crease)
-    return Crown(Mesh(at, _normals(at, triangles), triangles), shade)
+    return Crown(Mesh(at, smooth_normals(at, triangles), triangles), shade)
 
 
 def tree_trunk(species: Species, height_m: float, radius_m: float) -> Mesh:
@@ -151,13 +151,6 @@ def _neighbours(triangles: Ints, count: int) -> tuple[Ints, Ints]:
     return pairs[:, 1], np.searchsorted(pairs[:, 0], np.arange(count)).astype(np.int32)
 
 
-def _normals(at: Floats, triangles: Ints) -> Floats:
-    one, two = (at[triangles[:, i]] - at[triangles[:, 0]] for i in (1, 2))
-    normals = np.zeros_like(at)
-    np.add.at(normals, triangles.ravel(), np.repeat(np.cross(one, two), 3, axis=0))
-    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12))
-
-
 def _tube(middles: Floats, radii: Floats, around: Floats) -> Mesh:
     """A tube through (N, 3) points with (N,) radii, open at its ends, its rings level."""
     circle = np.column_stack([np.cos(around), np.sin(around), np.zeros(len(around))])
@@ -169,4 +162,4 @@ def _tube(middles: Floats, radii: Floats, around: Floats) -> Mesh:
         a, b = row * len(k), (row + 1) * len(k)
         found += [np.stack([a + k, a + after, b + after], 1), np.stack([a + k, b + after, b + k], 1)]
     triangles = np.concatenate(found).astype(np.int32)
-    return Mesh(at, _normals(at, triangles), triangles)
+    return Mesh(at, smooth_normals(at, triangles), triangles)

@@ -217,6 +217,7 @@ GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
     "tactile-bars": Recipe(0.6, _tactile(bars=True)),
     "paint": Recipe(2.0, _paint(0.35)),
     "paint-worn": Recipe(2.0, _paint(1.0)),
+    "plain": Recipe(1.0, lambda noise: Picture(np.full((noise.size, noise.size, 3), 0.8))),
 }
 
 SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {

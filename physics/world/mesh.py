@@ -98,6 +98,16 @@ def join(meshes: Sequence[Mesh]) -> Mesh:
     )
 
 
+def smooth_normals(vertices: Floats, triangles: Ints) -> Floats:
+    """(V, 3) unit normals: means of the triangles around, by area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    face = np.cross(b - a, c - a)
+    total = np.zeros_like(vertices)
+    for axis in range(3):
+        total[:, axis] = np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(vertices))
+    return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+
+
 def quads(corners: Floats) -> Mesh:
     """Flat quadrilaterals. corners: (N, 4, 3), counter-clockwise from the front."""
     if len(corners) == 0:

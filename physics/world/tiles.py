@@ -27,7 +27,7 @@ from cosim.place import overlay
 from cosim.place.street_map import PieceKind, StreetMap, Strip, union_closed
 from cosim.place.terrain import Terrain
 from physics.world.materials import PAVINGS, Paving, cuts
-from physics.world.mesh import Mesh, quads
+from physics.world.mesh import Mesh, quads, smooth_normals
 from physics.world.relief import Relief, potholes
 
 TILE_M: Final = 48.0
@@ -120,6 +120,15 @@ def distances_within(x_m: float, y_m: float, radius_m: float) -> list[tuple[floa
     keys = [(i, j) for j in range(j0, j1 + 1) for i in range(i0, i1 + 1)]
     found = [(distance_to(key, x_m, y_m), key) for key in keys]
     return [one for one in found if one[0] <= radius_m]
+
+
+def keys_in(area: shapely.Geometry) -> list[Key]:
+    """Tiles that an area touches, column by column."""
+    x0, y0, x1, y1 = shapely.bounds(area).tolist()
+    (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
+    keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
+    shapely.prepare(area)
+    return [key for key in keys if shapely.intersects(area, shapely.box(*square(key)))]
 
 
 def distance_to(key: Key, x_m: float, y_m: float) -> float:
@@ -332,17 +341,10 @@ def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = Fa
     corners = index.reshape(-1, 3).astype(np.int32)
     vertices = np.column_stack([xy[used], z[used]])
     normals = np.tile([0.0, 0.0, 1.0], (len(used), 1))
-    return Mesh(vertices, _normals(vertices, corners) if shaded else normals, corners)
-
-
-def _normals(vertices: Floats, triangles: NDArray[np.int32]) -> Floats:
-    """Upward normals of vertices: of the triangles around each, by their areas."""
-    one, two = (vertices[triangles[:, i]] - vertices[triangles[:, 0]] for i in (1, 2))
-    face = np.repeat(np.cross(one, two), 3, axis=0)
-    normals = np.zeros_like(vertices)
-    np.add.at(normals, triangles.ravel(), face)
-    normals[:, 2] = np.maximum(normals[:, 2], 1e-9)
-    return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
+    if shaded:
+        slopes = smooth_normals(vertices, corners)
+        normals = np.where(slopes[:, 2:] > 0.0, slopes, normals)
+    return Mesh(vertices, normals, corners)
 
 
 def _append(a: Mesh, b: Mesh) -> Mesh:

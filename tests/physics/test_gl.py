@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 
-import cv2
 import numpy as np
 import pytest
 
@@ -21,6 +20,7 @@ from physics.cameras.gl.camera import GlCamera
 from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from scenarios.execution.places import place
+from tests.physics.parity import agreement
 
 pytestmark = [
     pytest.mark.engine,
@@ -52,12 +52,6 @@ def stand_at(world: BulletWorld, strip: Strip, share: float, heading_rad: float)
     return RobotState(Pose(float(x), float(y), heading_rad), z_m=world.height_at(float(x), float(y)))
 
 
-def off_edges(*labels: np.ndarray) -> np.ndarray:
-    """Where no label changes within 2 pixels, in any of the pictures."""
-    window = np.ones((5, 5), dtype=np.uint8)
-    return np.logical_and.reduce([cv2.dilate(a, window) == cv2.erode(a, window) for a in labels])
-
-
 @pytest.mark.parametrize("city", CITIES, ids=lambda city: city.name)
 def test_both_cameras_see_the_same(city: City) -> None:
     """In 25 views from five places of a city labels agree on 97 % of the pixels off edges, and depth to 2 cm."""
@@ -75,12 +69,9 @@ def test_both_cameras_see_the_same(city: City) -> None:
                 strip = strips[int(rng.integers(len(strips)))]
             robot = stand_at(world, strip, float(rng.uniform(0.1, 0.9)), float(rng.uniform(-math.pi, math.pi)))
             street = street_at(street_map, robot.pose.xy, rng)
-            a, b = one.render(robot, street), other.render(robot, street)
-            assert a.labels is not None and b.labels is not None and a.depth is not None and b.depth is not None
-            clear = off_edges(a.labels, b.labels)
-            agree.append((a.labels == b.labels)[clear].mean())
-            near = clear & (a.depth < 100.0) & (b.depth < 100.0)
-            depths.append(np.median(np.abs(a.depth - b.depth)[near]))
+            alike, gap_m = agreement(one.render(robot, street), other.render(robot, street))
+            agree.append(alike)
+            depths.append(gap_m)
     assert min(agree) >= 0.97
     assert max(depths) <= 0.02
 

@@ -1,8 +1,7 @@
-"""The robot's body from the shapes of its URDF: boxes and cylinders in their colours."""
+"""The robot's body from the shapes of its URDF: boxes, cylinders and files of meshes in their colours."""
 
 from __future__ import annotations
 
-import math
 import xml.etree.ElementTree as xml
 from functools import lru_cache
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
 from physics.cameras.gl.instances import Coat
+from physics.world.bullet import p
 from physics.world.mesh import Mesh, box, frustum, join
 
 _GREY = (0.6, 0.6, 0.6)
@@ -51,13 +51,9 @@ def _origin(element: xml.Element) -> tuple[Floats, Floats]:
     origin = element.find("origin")
     if origin is None:
         return np.eye(3), np.zeros(3)
-    roll, pitch, yaw = (float(v) for v in origin.get("rpy", "0 0 0").split())
-    shift = np.array([float(v) for v in origin.get("xyz", "0 0 0").split()])
-    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(a), math.sin(a)) for a in (roll, pitch, yaw))
-    about_x = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    about_y = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    about_z = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-    return about_z @ about_y @ about_x, shift
+    angles, shift = ([float(v) for v in origin.get(name, "0 0 0").split()] for name in ("rpy", "xyz"))
+    turn = p.getMatrixFromQuaternion(p.getQuaternionFromEuler(angles))
+    return np.array(turn).reshape(3, 3), np.array(shift)
 
 
 def _shape(visual: xml.Element, urdf: Path) -> Mesh:
@@ -70,8 +66,13 @@ def _shape(visual: xml.Element, urdf: Path) -> Mesh:
         upper = frustum((radius, radius), (radius, radius), -half, half, sides=16)
         flip = np.array([1.0, -1.0, -1.0])
         return join([upper, Mesh(upper.vertices * flip, upper.normals * flip, upper.triangles)])
+    if shape is not None and shape.tag == "mesh":
+        from physics.world.mesh_surface import as_mesh, read_mesh  # trimesh takes 0.2 s, which most robots do not need
+
+        scale = np.array([float(v) for v in shape.get("scale", "1 1 1").split()])
+        return as_mesh(read_mesh(urdf.parent / shape.get("filename", "")).apply_scale(scale))
     what = "nothing" if shape is None else f"a {shape.tag}"
-    raise EngineError(f"{urdf}: a visual shows {what}; the gl camera draws boxes and cylinders")
+    raise EngineError(f"{urdf}: a visual shows {what}; the gl camera draws boxes, cylinders and meshes")
 
 
 def _colour(material: xml.Element) -> tuple[float, float, float]:

@@ -31,6 +31,7 @@ from physics.robots import RobotModel
 from physics.street import props, vehicles
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
+from physics.world.bullet import p
 from physics.world.surface import Patch, Surface
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
 
@@ -286,7 +287,9 @@ class GlScene:
         lean = self._surface.road(xy, heading, which.size[rows])
         placed = instances(np.column_stack([xy - self._anchor, lean[:, 0]]), heading, paints, LABELS["vehicle"])
         if lean.any():
-            placed["turn"] = [_quaternion(r, p, h) for (_, r, p), h in zip(lean, heading, strict=True)]
+            placed["turn"] = [
+                p.getQuaternionFromEuler((*turn, h)) for turn, h in zip(lean[:, 1:], heading, strict=True)
+            ]
         seen, casts = seen[rows], casts[rows]
         return (form[seen], placed[seen]), (form[casts], placed[casts])
 
@@ -306,7 +309,7 @@ class GlScene:
         _, roll, pitch = self._surface.lean(robot.pose, self._model)
         rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
         rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
-        rows["turn"] = _quaternion(roll, pitch, robot.pose.heading_rad)
+        rows["turn"] = p.getQuaternionFromEuler((roll, pitch, robot.pose.heading_rad))
         return np.array([form]), rows
 
 
@@ -325,13 +328,3 @@ def _set(things: Things, placed: Sequence[_Placed]) -> None:
 def _near(xy: Floats, middle: Floats, reach_m: float | Floats) -> NDArray[np.bool_]:
     """Which of (N, 2) points are less than so far from the first two of `middle`."""
     return np.asarray(np.hypot(xy[:, 0] - middle[0], xy[:, 1] - middle[1]) < reach_m)
-
-
-def _quaternion(roll: float, pitch: float, yaw: float) -> tuple[float, float, float, float]:
-    (cx, sx), (cy, sy), (cz, sz) = ((math.cos(0.5 * a), math.sin(0.5 * a)) for a in (roll, pitch, yaw))
-    return (
-        sx * cy * cz - cx * sy * sz,
-        cx * sy * cz + sx * cy * sz,
-        cx * cy * sz - sx * sy * cz,
-        cx * cy * cz + sx * sy * sz,
-    )

@@ -1,0 +1,53 @@
+"""What the gl camera draws of a robot: the shapes of its URDF, files of meshes among them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from cosim.core.errors import EngineError, SpecError
+from physics.cameras.gl.robot_body import robot_parts
+from physics.robots import robot
+
+CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
+
+
+def with_visual(folder: Path, shape: str) -> Path:
+    """The courier, its first box shown as something else."""
+    text = robot("courier").urdf.read_text()
+    path = folder / "other.urdf"
+    path.write_text(CHASSIS.sub(shape, text, count=1))
+    return path
+
+
+@pytest.mark.parametrize("ending", ["obj", "stl", "glb"])
+def test_a_body_from_a_file_is_drawn_like_one_of_boxes(tmp_path: Path, ending: str) -> None:
+    """A box in a file, scaled by the URDF, has the corners, normals, colour and place of the box it stands for."""
+    box = CHASSIS.search(robot("courier").urdf.read_text())
+    assert box is not None
+    size = np.array(box[1].split(), dtype=float)
+    trimesh.creation.box(10.0 * size).export(tmp_path / f"chassis.{ending}")
+    made = robot_parts(with_visual(tmp_path, f'<mesh filename="chassis.{ending}" scale="0.1 0.1 0.1"/>'))
+    plain = robot_parts(robot("courier").urdf)
+    assert [part.colour for part in made] == [part.colour for part in plain]
+    for one, other in zip(made, plain, strict=True):
+        assert corners(one.mesh) == corners(other.mesh)
+
+
+def corners(mesh: object) -> set[tuple[float, ...]]:
+    """Positions and normals of the corners of a mesh, to a hundredth of a millimetre."""
+    rows = np.column_stack([mesh.vertices, mesh.normals])  # type: ignore[attr-defined]
+    return set(map(tuple, (np.rint(1e5 * rows) + 0.0).tolist()))
+
+
+def test_a_body_that_cannot_be_drawn_is_named(tmp_path: Path) -> None:
+    """A file that is not there, and a shape that is none."""
+    with pytest.raises(SpecError, match=r"gone\.stl: cannot be read as a mesh"):
+        robot_parts(with_visual(tmp_path, '<mesh filename="gone.stl"/>'))
+    robot_parts.cache_clear()
+    with pytest.raises(EngineError, match=r"a visual shows a capsule; the gl camera draws boxes, cylinders and meshes"):
+        robot_parts(with_visual(tmp_path, '<capsule radius="1" length="2"/>'))
