@@ -18,7 +18,7 @@ from cosim.cli.board import Board
 from cosim.cli.city import city_app
 from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
-from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, film, look
+from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, export, film, look
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
@@ -301,6 +301,7 @@ app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim film runs/mine lh-0
     film
 )
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")(export)
 app.command("counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(
     compare_one
 )

@@ -1,4 +1,4 @@
-"""The command line for eyes: `cosim look`, `cosim film`."""
+"""The command line for eyes: `cosim look`, `cosim film`, `cosim export`."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def look(
 
     picked = view_of(view)
     pixels = size_of(size)
-    check_picture(output)
+    check_output(output)
     found = holding(scenario) if suite is None else load_suite(suite)
     whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
     (one,) = scenarios_chosen(whole, [scenario])
@@ -95,6 +95,25 @@ def film(
     out.print(f"Film: {output} ({same})", soft_wrap=True, highlight=False)
 
 
+def export(
+    scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
+    output: Annotated[Path, typer.Argument(metavar="FILE", help="Where to write the street, a .glb.")],
+    suite: Annotated[
+        str | None, typer.Option(help="Where the scenario is: a suite or a suite's .json file; by default looked up.")
+    ] = None,
+) -> None:
+    """Write the street along a scenario's route as glTF: ground, buildings, trees, furniture, signals, barriers."""
+    check_output(output, "glTF", (".glb",))
+    from scenarios.catalog import holding, load_suite, scenarios_chosen
+    from scenarios.viewing.export import export_street
+
+    (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])
+    with doing("reading the scenario") as tell:
+        tiles = export_street(one, output, tell)
+    size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
+    out.print(f"Street: {output} ({one.id}, {size})", soft_wrap=True, highlight=False)
+
+
 def view_of(name: str) -> Viewpoint:
     """The view called so. Raises UsageError with the valid names."""
     from scenarios.viewing.look import VIEWS
@@ -113,10 +132,10 @@ def size_of(text: str) -> tuple[int, int]:
     return int(parts[0]), int(parts[1])
 
 
-def check_picture(path: Path) -> None:
-    """Before it is drawn: raises UsageError when no picture can have this name, MachineError without its folder."""
-    if path.suffix.lower() not in PICTURES:
-        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png or .jpg")
+def check_output(path: Path, what: str = "a picture", endings: tuple[str, ...] = PICTURES) -> None:
+    """Before it is made: raises UsageError when no such file can have this name, MachineError without its folder."""
+    if path.suffix.lower() not in endings:
+        raise UsageError(f"{path}: cannot be written as {what}; use a name that ends in {' or '.join(endings[:2])}")
     if not path.resolve().parent.is_dir():
         raise MachineError(f"{path}: cannot be written: no folder {path.parent}")
 

@@ -23,7 +23,7 @@ from physics.street.props import SignalPost, posts_in
 from physics.textures.ground import layer_of
 from physics.world.materials import PAVINGS, PLAIN_FRICTION, Paving, friction
 from physics.world.surface import Chunk, Finish, Patch, Surface
-from physics.world.tiles import Key, Tile, build_tile, cells_of, key_at, square, surface
+from physics.world.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
 
 _KEPT: Final = 100
 
@@ -97,14 +97,7 @@ class StreetSurface(Surface):
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
         """Props in the tiles that an area touches."""
-        x0, y0, x1, y1 = shapely.bounds(area).tolist()
-        (i0, j0), (i1, j1) = key_at(x0, y0), key_at(x1, y1)
-        keys = [(i, j) for i in range(i0, i1 + 1) for j in range(j0, j1 + 1)]
-        squares = np.array([shapely.box(*square(key)) for key in keys], dtype=object)
-        shapely.prepare(area)
-        return [
-            prop for k in np.flatnonzero(shapely.intersects(area, squares)) for prop in self._placement.in_tile(keys[k])
-        ]
+        return [prop for key in keys_in(area) for prop in self._placement.in_tile(key)]
 
     def _trees(self, key: Key) -> list[tuple[float, float]]:
         """Where trees stand in a tile and around it."""
