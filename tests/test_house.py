@@ -84,6 +84,13 @@ def test_architecture_shows_the_floors_that_are_enforced() -> None:
     assert f"```\n{chr(10).join([layers[0], '', layers[1]])}\n```" in (ROOT / "ARCHITECTURE.md").read_text()
 
 
+def test_architecture_tells_the_size_of_the_tiles_that_are_loaded() -> None:
+    """The sentence about the ground's tiles names the size that the code has."""
+    from physics.world.tiles import TILE_M
+
+    assert f"Tiles of {TILE_M:g} m are loaded around the robot." in (ROOT / "ARCHITECTURE.md").read_text()
+
+
 def test_no_folder_is_flat_and_endless() -> None:
     """No folder of the product holds more than 20 modules."""
     for room in ROOMS:

@@ -86,12 +86,6 @@ def directions(rows: int) -> Floats:
     return np.stack([flat * np.cos(turn), flat * np.sin(turn), np.sin(rise) + 0.0 * turn], axis=-1)
 
 
-def filmic(radiance: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Tone curve from 0 to 1: K. Narkowicz's fit (2015) of the ACES reference curve."""
-    x = np.maximum(radiance, 0.0)
-    return np.asarray(np.clip(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 0.0, 1.0))
-
-
 def irradiance(radiance: NDArray[np.floating], towards: Floats) -> Floats:
     """(3,) radiance of a white matt surface facing `towards`, lit by an equirectangular (H, 2H, 3) picture."""
     rows = len(radiance)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
@@ -79,9 +80,5 @@ def _turn(rows: Floats, name: str) -> Floats:
     at = _COLUMNS[name]
     if name in _HINGES:
         return np.column_stack([np.zeros(len(rows)), -rows[:, at], np.zeros(len(rows))])
-    w, x, y, z = (rows[:, at : at + 4] / np.linalg.norm(rows[:, at : at + 4], axis=1, keepdims=True)).T
-    vector = np.column_stack([x, -z, y]) * np.where(w < 0.0, -1.0, 1.0)[:, None]
-    sine = np.linalg.norm(vector, axis=1, keepdims=True)
-    return np.asarray(
-        vector * np.where(sine > 1e-9, 2.0 * np.arctan2(sine, np.abs(w)[:, None]) / np.maximum(sine, 1e-9), 2.0)
-    )
+    w, x, y, z = rows[:, at : at + 4].T
+    return Rotation.from_quat(np.column_stack([x, -z, y, w])).as_rotvec()

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS
-from physics.people.captures import Capture
 from physics.people.families import FAMILIES, Family, skeleton
 from physics.people.gaits import CYCLE_FRAMES as STRIDE_FRAMES
 from physics.people.gaits import gait
@@ -45,14 +44,11 @@ class Clips:
 @lru_cache(maxsize=1)
 def own_clips() -> Clips:
     """The motions of our own bodies."""
-    return baked([(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES])
+    return _baked([(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES])
 
 
-def baked(bodies: list[tuple[Skeleton, float, Floats]], walk: Capture | None = None) -> Clips:
-    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled.
-
-    walk: one stride, taken instead of the shipped walk.
-    """
+def _baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
+    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
     rows: list[NDArray[np.float32]] = []
     walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
     standing = {name: np.zeros(len(bodies), dtype=np.intp) for name in GESTURES}
@@ -61,7 +57,7 @@ def baked(bodies: list[tuple[Skeleton, float, Floats]], walk: Capture | None = N
         bind = bind_of(body, modelled)
         for knot in range(len(PACES_MPS)):
             walking[k, knot] = at
-            rows.append(skinning(*forward(*gait(knot, body, stoop_rad, walk), body), bind))
+            rows.append(skinning(*forward(*gait(knot, body, stoop_rad), body), bind))
             at += len(rows[-1])
         for name, first in standing.items():
             first[k] = at
@@ -70,11 +66,6 @@ def baked(bodies: list[tuple[Skeleton, float, Floats]], walk: Capture | None = N
     matrices = np.concatenate(rows)
     matrices.flags.writeable = False
     return Clips(matrices, walking, MappingProxyType(standing))
-
-
-def clips_for(body: Skeleton, walk: Capture | None = None) -> Clips:
-    """The motions of one body that everybody wears, modelled in the T pose, such as a user's SMPL body."""
-    return baked([(body, 0.0, model_pose(0.0))] * len(FAMILIES), walk)
 
 
 def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:

@@ -20,7 +20,6 @@ Legs = Literal["trousers", "shorts", "skirt", "coat"]
 TORSO: Final = (28, 18, 6, 4)
 LIMB: Final = (14, 10, 6, 4)
 SMALL: Final = (12, 8, 6, 4)
-FINE: Final = (6, 4, 0, 0)
 
 
 @dataclass(frozen=True, slots=True)

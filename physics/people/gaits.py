@@ -8,7 +8,7 @@ trunk, head and arms are those of the captures; how far a capture's motion goes 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
 
@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS, REFERENCE_M, STRIDES_M
-from physics.people.captures import Capture, capture
+from physics.people.captures import capture
 from physics.people.limbs import about_y, about_z, set_leg
 from physics.people.skeleton import INDEX, MIRRORED, Skeleton, axis_angle, rodrigues
 
@@ -84,17 +84,13 @@ class _Cycle:
     sway_m: Floats
 
 
-def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0, walk: Capture | None = None) -> tuple[Floats, Floats]:
+def gait(knot: int, skeleton: Skeleton, stoop_rad: float = 0.0) -> tuple[Floats, Floats]:
     """The stride at the pace `cosim.people.gait.PACES_MPS[knot]`: turns (FRAMES, 24, 3, 3), pelvis (FRAMES, 3) metres.
 
-    The body stays above the origin. stoop_rad: how far the back is bent. walk: one stride, from one touch of the left
-    heel to the next, whose trunk, head and arms are taken instead of the shipped walk's.
+    The body stays above the origin. stoop_rad: how far the back is bent.
     """
     style = _RUN if PACES_MPS[knot] > _RUNS_FROM_MPS else _WALK
-    if walk is not None and style is _WALK:
-        cycle = _cycle_of(walk, replace(style, frames=len(walk.turns) - 1, touch=0.0))
-    else:
-        cycle = _cycle(style)
+    cycle = _cycle(style)
     scale = skeleton.height_m / REFERENCE_M
     stride_m = STRIDES_M[knot] * scale
     share = min(STRIDES_M[knot] / style.stride_m, 1.25)
@@ -179,10 +175,6 @@ def _height(
 @lru_cache(maxsize=4)
 def _cycle(style: _Style) -> _Cycle:
     taken = capture(style.name)
-    return _cycle_of(taken, style)
-
-
-def _cycle_of(taken: Capture, style: _Style) -> _Cycle:
     vectors = axis_angle(taken.turns[: style.frames + 1])
     pelvis = taken.pelvis_m[: style.frames + 1]
     curves = np.concatenate([vectors.reshape(len(vectors), -1), pelvis[:, 1:]], axis=1)

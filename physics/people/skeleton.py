@@ -10,10 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
 
 from cosim.core.geometry import Floats
 
@@ -52,21 +53,12 @@ class Skeleton:
 def rodrigues(turns_rad: ArrayLike) -> Floats:
     """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's axis-angle)."""
     turns = np.asarray(turns_rad, dtype=float)
-    angle = np.linalg.norm(turns, axis=-1)[..., None, None]
-    x, y, z = np.moveaxis(turns / np.maximum(angle[..., 0], 1e-12), -1, 0)
-    o = np.zeros_like(x)
-    cross = np.stack([np.stack([o, -z, y], -1), np.stack([z, o, -x], -1), np.stack([-y, x, o], -1)], -2)
-    return np.asarray(np.eye(3) + np.sin(angle) * cross + (1.0 - np.cos(angle)) * cross @ cross)
+    return Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(*turns.shape, 3)
 
 
 def axis_angle(matrices: Floats) -> Floats:
     """(..., 3) axis-angle vectors of (..., 3, 3) rotations of less than half a turn."""
-    skew = 0.5 * (matrices - np.swapaxes(matrices, -1, -2))
-    vector = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
-    sine = np.linalg.norm(vector, axis=-1, keepdims=True)
-    cosine = 0.5 * (np.trace(matrices, axis1=-2, axis2=-1)[..., None] - 1.0)
-    angle = np.arctan2(sine, cosine)
-    return np.asarray(vector * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
+    return Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec().reshape(matrices.shape[:-1])
 
 
 def forward(turns: Floats, pelvis_m: Floats, skeleton: Skeleton) -> tuple[Floats, Floats]:
@@ -100,12 +92,3 @@ def skinning(rotation: Floats, position: Floats, bind: tuple[Floats, Floats]) ->
     turn = rotation @ np.swapaxes(bind[0], -1, -2)
     shift = position - np.einsum("fjab,jb->fja", turn, bind[1])
     return np.concatenate([turn, shift[..., None]], axis=-1).astype(np.float32)
-
-
-def skinned(vertices: Floats, joints: NDArray[Any], weights: Floats, matrices: NDArray[np.float32]) -> Floats:
-    """(V, 3) vertices of one posed body by linear blend skinning: each the weighted mean of what its joints make of it.
-
-    vertices (V, 3); joints (V, K) rows; weights (V, K) that sum to 1; matrices (24, 3, 4) as from `skinning`.
-    """
-    blend = np.einsum("vk,vkab->vab", weights, matrices[joints].astype(float))
-    return np.asarray(np.einsum("vab,vb->va", blend[..., :3], vertices) + blend[..., 3])

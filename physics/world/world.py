@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import TracebackType
-from typing import Final, Literal, Self
+from typing import Final, Self
 
 import numpy as np
 
@@ -28,8 +28,6 @@ PEOPLE_REACH_M: Final = 6.0
 _VEHICLE_REACH_M: Final = 10.0
 _LOAD_M: Final = 20.0
 _UNLOAD_M: Final = 40.0
-
-Kind = Literal["pedestrian", "vehicle", "wall", "object"]
 
 
 class BulletWorld:
@@ -76,10 +74,6 @@ class BulletWorld:
             self._bodies.close()
             self._bodies = None
             self._tiles.clear()
-
-    def height_at(self, x_m: float, y_m: float) -> float:
-        """Height of the ground at a point, in metres."""
-        return float(self.surface.heights([[x_m, y_m]])[0])
 
     def place(self, pose: Pose) -> RobotState:
         """Put the robot at rest at a pose, its wheels on the ground."""

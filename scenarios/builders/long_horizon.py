@@ -11,7 +11,7 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Polyline
-from cosim.place.map_check import on_road_shares
+from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
@@ -20,11 +20,6 @@ from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenar
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
 from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of
 from scenarios.builders.hems import hem
-
-_SHORTEST_M = 120.0
-_LONGEST_M = 560.0
-STRIP_MIN_M = 30.0
-"""Start and goal lie on sidewalks at least this long."""
 
 HALF_WIDTH_M = 0.32
 IN_GROUPS = 0.3
@@ -63,11 +58,11 @@ def build_long_horizon(place: Place, street_map: StreetMap, graph: WalkGraph, se
     candidates = sorted(
         strip_id
         for strip_id in graph.main_strips
-        if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= STRIP_MIN_M
+        if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= START_M
         if strip_id not in street_map.steep
     )
     if not candidates:
-        raise MapError(f"map '{street_map.name}' has no sidewalk of {STRIP_MIN_M:g} m to start on")
+        raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
     drawn, searched = Refusals(), Refusals()
     draws = (lambda: _draw(place, street_map, graph, rng, candidates, seed, scenario_id) for _ in range(TRIES))
     search = _search(place, street_map, graph, candidates, seed, scenario_id)
@@ -105,7 +100,7 @@ def _along(
 ) -> Scenario:
     """The scenario along a way. Raises SpecError when the way does not do."""
     route = Polyline(np.round(way_line(street_map, way, *ends_m).points, 3))
-    if not _SHORTEST_M <= route.length_m <= 1.2 * _LONGEST_M:
+    if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
@@ -170,7 +165,7 @@ def draw_way(
     street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str]
 ) -> tuple[list[Port], float, float]:
     """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line` takes it."""
-    target_m = rng.uniform(_SHORTEST_M, _LONGEST_M)
+    target_m = rng.uniform(*ROUTE_M)
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
@@ -196,7 +191,7 @@ def search_way(
     street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str], avoided: Set[str]
 ) -> tuple[list[Port], float, float]:
     """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that does."""
-    target_m = rng.uniform(_SHORTEST_M, _LONGEST_M)
+    target_m = rng.uniform(*ROUTE_M)
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m

@@ -80,9 +80,6 @@ class StreetClass(NamedTuple):
         )
 
 
-WALKWAY_STRIPE_M = 0.64
-"""Width of the stripes in which SUMO's walkers keep: walkways are an odd number of them wide."""
-
 CLASSES = {
     "residential": StreetClass(
         1, 8.33, 3, (3.0, 3.4), (1.2, 2.2), (1.92, 3.2, 3.2), (2.0, 4.5), (0.1, 0.2), (0.25, 0.4), driveways=1 / 50
@@ -135,18 +132,6 @@ def bend(a: Point, b: Point, leave_rad: float, arrive_rad: float) -> Line:
         w = ((1 - t) ** 3, 3 * t * (1 - t) ** 2, 3 * t * t * (1 - t), t**3)
         line.append(tuple(w[0] * a[k] + w[1] * c[k] + w[2] * d[k] + w[3] * b[k] for k in (0, 1)))
     return [a, *((x, y) for x, y in line[1:-1]), b]
-
-
-def curve(a: Point, b: Point, turn_rad: float) -> Line:
-    """The curve block: leaves a `turn_rad` left of the chord and arrives as much right of it."""
-    chord = direction(a, b)
-    return bend(a, b, chord + turn_rad, chord - turn_rad)
-
-
-def s_bend(a: Point, b: Point, turn_rad: float) -> Line:
-    """The S-bend block: leaves a and arrives at b `turn_rad` left of the chord."""
-    chord = direction(a, b)
-    return bend(a, b, chord + turn_rad, chord + turn_rad)
 
 
 def corner(a: Point, via: Point, b: Point, radius_m: float) -> Line:

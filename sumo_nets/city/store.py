@@ -11,6 +11,7 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import msgspec
+from platformdirs import user_cache_path
 
 from cosim.core.errors import MapError, unwritable
 from cosim.spec.scenario import City
@@ -41,9 +42,8 @@ NETCONVERT = (
 
 
 def cache_folder() -> Path:
-    """Where built nets are kept: $COSIM_CACHE, else ~/.cache/sidewalk-cosim."""
-    chosen = os.environ.get("COSIM_CACHE")
-    return Path(chosen) if chosen else Path.home() / ".cache" / "sidewalk-cosim"
+    """Where built nets are kept: $COSIM_CACHE, else the user's cache folder (~/.cache/sidewalk-cosim)."""
+    return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
 def city_net(city: City) -> Path:

@@ -11,7 +11,10 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple
 
+import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString
 
 from cosim.core.geometry import Pose, heading_to_sumo
@@ -245,17 +248,13 @@ def _line(engine: Any, edge: str) -> shapely.Geometry:
 
 def _meeting_places(street_map: StreetMap) -> dict[str, str]:
     """Corner or crossing id -> id of the first of the corners that it is joined with by crossings."""
-    place = {corner: corner for corner in street_map.corners}
-
-    def root(corner: str) -> str:
-        while place[corner] != corner:
-            corner = place[corner]
-        return corner
-
-    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing"]
-    for crossing in crossings:
-        joined = sorted({root(corner) for corner in crossing.corners if corner is not None})
-        for corner in joined:
-            place[corner] = joined[0]
-    roots = {corner: root(corner) for corner in place}
-    return roots | {c.id: roots[c.corners[0] or c.corners[1] or ""] for c in crossings if any(c.corners)}
+    corners = sorted(street_map.corners)
+    row = {corner: k for k, corner in enumerate(corners)}
+    crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing" and any(strip.corners)]
+    joins = [[row[corner] for corner in crossing.corners if corner is not None] for crossing in crossings]
+    first, last = np.array([(join[0], join[-1]) for join in joins], dtype=int).reshape(-1, 2).T
+    joined = coo_array((np.ones(len(first)), (first, last)), shape=(len(corners), len(corners)))
+    _, parts = connected_components(joined, directed=False)
+    _, firsts = np.unique(parts, return_index=True)
+    place = {corner: corners[firsts[part]] for corner, part in zip(corners, parts, strict=True)}
+    return place | {crossing.id: place[corners[join[0]]] for crossing, join in zip(crossings, joins, strict=True)}

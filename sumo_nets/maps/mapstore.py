@@ -27,7 +27,7 @@ from sumo_nets.net.netfacts import read_facts
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"
-IMPORTER = 2
+IMPORTER = 3
 """Version of the importer: another one for every change that changes an imported net."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
 """File names that name no place: the folder's name is taken instead."""

@@ -49,7 +49,7 @@ def street_at(street_map: StreetMap, spot: np.ndarray, rng: np.random.Generator)
 
 def stand_at(world: BulletWorld, strip: Strip, share: float, heading_rad: float) -> RobotState:
     x, y = strip.line[0] + share * (strip.line[1] - strip.line[0])
-    return RobotState(Pose(float(x), float(y), heading_rad), z_m=world.height_at(float(x), float(y)))
+    return RobotState(Pose(float(x), float(y), heading_rad), z_m=float(world.surface.heights([[x, y]])[0]))
 
 
 @pytest.mark.parametrize("city", CITIES, ids=lambda city: city.name)

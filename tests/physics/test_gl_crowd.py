@@ -25,7 +25,7 @@ from physics.people.clips import own_clips
 from physics.people.figure import LEVELS
 from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
-from physics.people.skeleton import skinned
+from tests.physics.blend import skinned
 
 pytestmark = [pytest.mark.engine, pytest.mark.skipif(not available(), reason="no OpenGL here")]
 
@@ -122,17 +122,6 @@ def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:
     u, v = 200.0 - focal * world[:, 1] / world[:, 0], 200.0 - focal * (world[:, 2] - 1.0) / world[:, 0]
     assert (columns.min(), columns.max() + 1) == pytest.approx((u.min(), u.max()), abs=2.0)
     assert (rows.min(), rows.max() + 1) == pytest.approx((v.min(), v.max()), abs=2.0)
-
-
-def test_a_body_of_the_users_is_worn_by_everybody() -> None:
-    """With a body given, people near and far are drawn with it, in our poses."""
-    with context() as gl:
-        made = body(ALL[0], 1)
-        everybody = CrowdDrawing(gl, False, made, own_clips())
-        taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
-        assert mask(everybody, street(0), taken).sum() > 500
-        everybody.draw("moving")
-        everybody.release()
 
 
 def test_nobody_is_drawn_as_nothing(crowd: CrowdDrawing) -> None:

@@ -99,7 +99,7 @@ def test_the_robot_holds_its_speed_up_and_down(hill: StreetMap, world: BulletWor
     assert np.mean([s.v_mps for s in driven]) == pytest.approx(1.5, rel=0.05)
     assert min(s.v_mps for s in driven) > 1.4
     assert max(s.tilt_rad for s in states) < 2.0 * GRADE
-    over = [s.z_m - world.height_at(s.pose.x_m, s.pose.y_m) for s in driven]
+    over = [s.z_m - world.surface.heights([[s.pose.x_m, s.pose.y_m]])[0] for s in driven]
     assert max(map(abs, over)) < 0.02
     assert abs(state.z_m - start_m) == pytest.approx(GRADE * 29.5, rel=0.1)
     assert (state.z_m > start_m) == up

@@ -24,7 +24,8 @@ from physics.people.gestures import SEAT_M, SEATED_BACK_M
 from physics.people.looks import ALL, family_of, look_of
 from physics.people.parts import RIGID_PARTS, part_colours, part_meshes, placed_parts
 from physics.people.poses import poses
-from physics.people.skeleton import INDEX, JOINTS, MIRRORED, PARENTS, axis_angle, forward, rodrigues, skinned
+from physics.people.skeleton import INDEX, JOINTS, MIRRORED, PARENTS, axis_angle, forward, rodrigues
+from tests.physics.blend import skinned
 
 ROOT = Path(__file__).parents[2]
 FORMS = [(outfit, level) for outfit in range(len(ALL)) for level in range(MESH_LEVELS)]

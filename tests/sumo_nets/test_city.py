@@ -16,11 +16,12 @@ import shapely
 from cosim.core.errors import MapError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City
-from sumo_nets.city.blocks import CLASSES, WALKWAY_STRIPE_M, corner, curve, direction, length, ring, s_bend, split
+from sumo_nets.city.blocks import CLASSES, bend, corner, direction, length, ring, split
 from sumo_nets.city.city import STYLES, plan_city
 from sumo_nets.city.plan import CityPlan
 from sumo_nets.city.signals import signal_faults
 from sumo_nets.city.store import build_city, city_net
+from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.netfile import read_net
@@ -71,12 +72,13 @@ def arms(plan: CityPlan) -> dict[str, list[float]]:
 def test_blocks_start_and_end_where_they_are_told() -> None:
     """Every primitive line keeps its ends, and curves leave and arrive with the turn asked for."""
     a, b = (0.0, 0.0), (100.0, 0.0)
-    for line in (curve(a, b, 0.5), s_bend(a, b, 0.5), corner(a, (100.0, 80.0), b, 30.0)):
+    curve, s_bend = bend(a, b, 0.5, -0.5), bend(a, b, 0.5, 0.5)
+    for line in (curve, s_bend, corner(a, (100.0, 80.0), b, 30.0)):
         assert (line[0], line[-1]) == (a, b)
         assert length(line) > 100.0
-    assert max(y for _, y in curve(a, b, 0.5)) > 10.0 > -0.1 < min(y for _, y in curve(a, b, 0.5))
-    assert min(y for _, y in s_bend(a, b, 0.5)) < -2.0 and max(y for _, y in s_bend(a, b, 0.5)) > 2.0
-    first, second = split(curve(a, b, 0.5), 40.0)
+    assert max(y for _, y in curve) > 10.0 > -0.1 < min(y for _, y in curve)
+    assert min(y for _, y in s_bend) < -2.0 and max(y for _, y in s_bend) > 2.0
+    first, second = split(curve, 40.0)
     assert first[-1] == second[0] and length(first) == pytest.approx(40.0, abs=0.1)
     arcs = ring(a, 20.0, [0.1, 2.0, 4.0])
     assert sum(length(arc) for arc in arcs) == pytest.approx(2.0 * math.pi * 20.0, rel=0.01)
@@ -120,7 +122,7 @@ def test_large_city_shows_every_primitive_block() -> None:
 def test_sidewalks_fit_the_stripes_of_the_crowd_model() -> None:
     """Every sidewalk and every crossing is an odd number of 0.64 m stripes wide."""
     for made in CLASSES.values():
-        assert all(round(width / WALKWAY_STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
+        assert all(round(width / GROUP_STRIPE_M, 6) % 2 == 1 for width in (*made.sidewalks_m, *made.crossings_m))
 
 
 def test_widths_differ_within_the_ranges_of_the_class() -> None:

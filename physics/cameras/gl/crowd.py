@@ -20,8 +20,8 @@ from cosim.core.state import People
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.skins import mesh_skins, tube_skins
 from physics.cameras.view import Shot
-from physics.people.body import COATS, SkinnedBody, body, far_body
-from physics.people.clips import Clips, own_clips
+from physics.people.body import COATS, body, far_body
+from physics.people.clips import own_clips
 from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
@@ -65,24 +65,17 @@ void main() {
 
 
 class CrowdDrawing:
-    """The people of a picture. shadows: whether they are shaded by shadow maps.
+    """The people of a picture. shadows: whether they are shaded by shadow maps."""
 
-    worn: a body that everybody wears, with clips made for it (`clips_for`), instead of our own.
-    """
-
-    def __init__(
-        self, context: moderngl.Context, shadows: bool, worn: SkinnedBody | None = None, clips: Clips | None = None
-    ) -> None:
+    def __init__(self, context: moderngl.Context, shadows: bool) -> None:
         self._context = context
-        self._clips = own_clips() if clips is None else clips
+        self._clips = own_clips()
         matrices = self._clips.matrices
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
-        near = (lambda outfit, level: body(ALL[outfit], level)) if worn is None else (lambda outfit, level: worn)
-        self._near = mesh_skins(context, near, shadows)
+        self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level), shadows)
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level), shadows)
-        self._worn = worn is not None
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
         self._starts = np.zeros((LEVELS * len(ALL), 3), dtype=np.uint32)
         self._known = np.zeros(len(self._starts), dtype=bool)
@@ -139,7 +132,7 @@ class CrowdDrawing:
         self._dyed.use(1)
         held = self._instances, self._commands
         if stage == "moving":
-            (self._near if self._worn else self._far).draw(stage, *held, shadow, near + far)
+            self._far.draw(stage, *held, shadow, near + far)
         else:
             self._near.draw(stage, *held, near, 0)
             self._far.draw(stage, *held, far, near)
@@ -162,8 +155,6 @@ class CrowdDrawing:
         """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows, which have a
         level of their own behind the last."""
         cast = np.full(len(outfit), LEVELS)
-        if self._worn:
-            level, outfit = np.zeros_like(level), np.zeros_like(outfit)
         in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
         people = np.concatenate([in_view, casting])
         if not len(people):
@@ -189,7 +180,7 @@ class CrowdDrawing:
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
         """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the coarsest level."""
-        form = np.where(form < LEVELS * len(ALL), form, 0 if self._worn else form - len(ALL))
+        form = np.where(form < LEVELS * len(ALL), form, form - len(ALL))
         if not self._known[form].all():
             for one in dict.fromkeys(form[~self._known[form]].tolist()):
                 level, outfit = divmod(one, len(ALL))

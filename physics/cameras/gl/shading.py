@@ -33,19 +33,14 @@ Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING
 holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free for drawables are
 units 0 and 1.
 
-A drawable takes part in a pass by
-
-    class Drawable(Protocol):
-        def draw(self, stage: Stage) -> None: ...
-
-drawing itself with its program of that stage: "colour"; "still", the shadows of what stands, drawn anew only
-when the eye has moved on; "moving", the shadows of what moves, drawn for every picture. A drawable that casts no shadow
-of a kind returns at once. Back faces are culled in the picture; front faces are counter-clockwise as in
-physics.world.mesh."""
+A drawable takes part in a pass by a method `draw(stage)`, drawing itself with its program of that stage: "colour";
+"still", the shadows of what stands, drawn anew only when the eye has moved on; "moving", the shadows of what moves,
+drawn for every picture. A drawable that casts no shadow of a kind returns at once. Back faces are culled in the
+picture; front faces are counter-clockwise as in physics.world.mesh."""
 
 from __future__ import annotations
 
-from typing import Final, Literal, NamedTuple, Protocol
+from typing import Final, Literal, NamedTuple
 
 import moderngl
 import numpy as np
@@ -64,12 +59,6 @@ SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
 ANCHOR_M: Final = 64.0
-
-
-class Drawable(Protocol):
-    """Something that is drawn."""
-
-    def draw(self, stage: Pass) -> None: ...
 
 
 class Programs(NamedTuple):
