@@ -10,6 +10,7 @@ import msgspec
 
 from cosim.core.errors import unknown
 from cosim.spec.scenario import Scenario, Suite, read_suite
+from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent / "suites"
 
@@ -25,10 +26,10 @@ def load_suite(name: str) -> Suite:
     'lh-011-00'
     """
     if name.endswith(".json"):
-        return read_suite(Path(name))
+        return read_suite(Path(name), EVENT_KINDS)
     if name not in SUITES:
         raise unknown("suite", name, [*SUITES, "path/to/suite.json"])
-    return read_suite(SUITES[name])
+    return read_suite(SUITES[name], EVENT_KINDS)
 
 
 def holding(scenario_id: str) -> Suite:

@@ -24,8 +24,8 @@ import msgspec
 from cosim.core.errors import SpecError
 from cosim.core.state import Command
 from cosim.episode.ports import Manifest, Observation
-from cosim.spec.events import EventName
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite
+from scenarios.events import EVENT_KINDS
 
 Tree = dict[str, Any]
 
@@ -176,7 +176,7 @@ def fates(whole: Tree, folder: Path, seeds: Iterator[int]) -> Iterator[Fate]:
     for seed in seeds:
         path.write_bytes(mutated(whole, seed))
         try:
-            suite = read_suite(path)
+            suite = read_suite(path, EVENT_KINDS)
         except SpecError as error:
             yield Fate(seed, "refused", str(error))
             continue
@@ -207,9 +207,9 @@ def small_suite(city: City) -> Tree:
 
     _, street_map = place(city)
     graph = WalkGraph(street_map)
-    kinds: tuple[EventName, ...] = ("conversing", "ped_crossing", "gesturing")
+    kinds = ("conversing", "ped_crossing", "gesturing")
     whole = [long_horizon.build_long_horizon(city, street_map, graph, 1, "long")]
-    whole += [reactive.build_reactive(kind, city, street_map, graph, 1, kind) for kind in kinds]
+    whole += [reactive.build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind) for kind in kinds]
     few = CrowdSpec(persons=6, radius_m=40.0, vehicles=2)
     scenarios = [msgspec.structs.replace(s, crowd=few) for s in whole]
     return json.loads(msgspec.json.encode(Suite(name="small", version="1", scenarios=tuple(scenarios))))  # type: ignore[no-any-return]

@@ -1,7 +1,8 @@
 """The witness of an episode's events: when they triggered, whether the camera could see them, whether their rules held.
 
 Rules beyond the goal (the paper's table): the robot passes round the whole group of `conversing` and the whole line of
-`queueing`, never between two of them. (`gesturing` ends its episode by a stop: see the referee.)
+`queueing` (`EventKind.passed_round`), never between two of them. (`gesturing` ends its episode by a stop: see the
+referee.)
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from cosim.core.geometry import Floats, Pose, wrap_angle
 from cosim.episode.step import Step
 from cosim.records.record import TriggeredEvent
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event, EventState, Walker
 from cosim.spec.scenario import Scenario
 
@@ -24,15 +26,14 @@ HALF_VIEW_RAD: Final = math.radians(45.0)
 """Half the width of a view in which everybody must have been once; narrower than every camera of the field."""
 PASSED_M: Final = 5.0
 """An event lies behind once the robot is this far beyond its place."""
-ROUND: Final = ("conversing", "queueing")
-"""Kinds of events that are to be passed round."""
 
 
 class Witness:
-    """Watches the steps of one episode, in order."""
+    """Watches the steps of one episode, in order. kinds: the table of its events."""
 
-    def __init__(self, scenario: Scenario, tick_ms: int) -> None:
+    def __init__(self, scenario: Scenario, kinds: EventKinds, tick_ms: int) -> None:
         self._events = scenario.events
+        self._round = [kinds[event.kind].passed_round for event in scenario.events]
         self._tick_ms = tick_ms
         self._states: tuple[EventState, ...] = ()
         self._seen = [False] * len(self._events)
@@ -45,11 +46,11 @@ class Witness:
         self._states = step.events.states
         self._furthest_m = max(self._furthest_m, step.route_s_after_m)
         before, after = step.robot.pose, step.motion.robot.pose
-        for i, (event, state) in enumerate(zip(self._events, self._states, strict=True)):
+        for i, state in enumerate(self._states):
             if state.phase not in ("acting", "over"):
                 continue
             self._seen[i] |= any(in_view(before, walker) for walker in state.walkers)
-            if state.phase == "acting" and event.kind in ROUND:
+            if state.phase == "acting" and self._round[i]:
                 self._between[i] |= went_between(before.xy, after.xy, state.walkers)
             for k, walker in enumerate(state.walkers):
                 self._tracks.append((step.tick, i, k, walker.x_m, walker.y_m))
@@ -69,9 +70,11 @@ class Witness:
                 triggered_at_s=None if state.triggered_tick is None else state.triggered_tick * self._tick_ms / 1000,
                 trigger_distance_m=state.trigger_distance_m,
                 seen=seen,
-                rule_met=None if event.kind not in ROUND else not between,
+                rule_met=not between if judged else None,
             )
-            for event, state, seen, between in zip(self._events, self._states, self._seen, self._between, strict=True)
+            for event, state, seen, judged, between in zip(
+                self._events, self._states, self._seen, self._round, self._between, strict=True
+            )
         )
 
 

@@ -7,8 +7,7 @@ started again in the middle of an episode without a trace in the result.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
-from types import MappingProxyType
+from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 import msgspec
@@ -16,25 +15,12 @@ import msgspec
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
-EventName = Literal[
-    "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing"
-]
-
-GROUPS: Mapping[EventName, tuple[int, int]] = MappingProxyType(
-    {
-        "obstructing": (1, 1), "conversing": (2, 4), "queueing": (2, 5), "frontal": (1, 1), "lateral": (1, 1),
-        "overtaking": (1, 1), "ped_crossing": (1, 4), "gesturing": (1, 1),
-    }
-)  # fmt: skip
-"""How many people each kind of event may have."""
-
-
 GUEST: Final = "ei-"
 """What the ids of injected pedestrians begin with."""
 
 
 class Event(Ranged, frozen=True, kw_only=True):
-    """One event: a pedestrian or a group on the way.
+    """One event: a pedestrian or a group on the way. kind: a row of a table of `EventKinds`, by its name.
 
     x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
     the robot's direction of travel. half_width_m: from there to either edge. half_length_m: of a crosswalk, from there
@@ -43,7 +29,7 @@ class Event(Ranged, frozen=True, kw_only=True):
     """
 
     id: str
-    kind: EventName
+    kind: str
     x_m: Annotated[float, WHERE_M]
     y_m: Annotated[float, WHERE_M]
     heading_rad: Annotated[float, HEADING_RAD]
@@ -67,12 +53,6 @@ class Event(Ranged, frozen=True, kw_only=True):
             )
         if re.match(GUEST, self.id):
             yield f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians"
-        fewest, most = GROUPS[self.kind]
-        if not fewest <= self.people <= most:
-            allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
-            yield f"{self.called}people of '{self.kind}' must be {allowed}, not {shown(self.people)}"
-        if (self.kind == "ped_crossing") != (self.half_length_m > 0.0):
-            yield f"{self.called}half_length_m is the crosswalk's: of 'ped_crossing', and of no other"
 
     @property
     def names(self) -> tuple[str, ...]:

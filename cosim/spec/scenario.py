@@ -9,6 +9,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Literal
@@ -18,9 +19,10 @@ import numpy as np
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
-from cosim.spec.spec_file import read_spec_file
+from cosim.spec.spec_file import in_lines, read_spec_file
 
 _SCHEMA = 1
 """Version of the scenario files; a reader refuses others."""
@@ -250,8 +252,6 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
         for called, field, s_m, beyond_m in places:
             if s_m > length_m + beyond_m:
                 yield f"{self.called}{called}{field} is {s_m:g}, but the route ends at {length_m:g}"
-        if self.ends_at == "stop" and all(event.kind != "gesturing" for event in self.events):
-            yield f"{self.called}ends_at 'stop' needs an event 'gesturing': somebody to stop for"
         names = Counter(name for event in self.events for name in event.names)
         if twice := sorted(name for name, count in names.items() if count > 1):
             yield f"{self.called}two events have a pedestrian '{twice[0]}': give one another id"
@@ -315,11 +315,37 @@ def _canonical(spec: msgspec.Struct) -> bytes:
     return msgspec.json.encode(tree)
 
 
-def read_suite(path: Path) -> Suite:
-    """The suite in a JSON file. Raises SpecError naming the file and the field, and what may stand there."""
+def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Iterator[str]:
+    """What of the events of a scenario, at `place` of its file, is not of the table or not as its rows say."""
+    for number, event in enumerate(scenario.events):
+        at = f"{place}.events[{number}]"
+        if event.kind not in kinds:
+            yield f"Invalid enum value {shown(event.kind)} - at `{at}.kind`. Valid choices: {', '.join(kinds)}"
+            continue
+        fewest, most = kinds[event.kind].people
+        if not fewest <= event.people <= most:
+            allowed = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+            yield f"{event.called}people of '{event.kind}' must be {allowed}, not {shown(event.people)} - at `{at}`"
+        if (kinds[event.kind].layout is None) != (event.half_length_m > 0.0):
+            crossings = " and ".join(f"'{kind.name}'" for kind in kinds.values() if kind.layout is None)
+            yield f"{event.called}half_length_m is the crosswalk's: of {crossings}, and of no other - at `{at}`"
+    stops = [kind.name for kind in kinds.values() if kind.ends_at == "stop"]
+    if scenario.ends_at == "stop" and not any(event.kind in stops for event in scenario.events):
+        needed = " or ".join(f"'{name}'" for name in stops)
+        yield f"{scenario.called}ends_at 'stop' needs an event {needed}: somebody to stop for - at `{place}`"
+
+
+def read_suite(path: Path, kinds: EventKinds | None = None) -> Suite:
+    """The suite in a JSON file. kinds: of events that there may be; None for a file that was read before.
+
+    Raises SpecError naming the file and the field, and what may stand there."""
     suite = read_spec_file(path, Suite)
     if not suite.scenarios:
         raise SpecError(f"{path}: suite '{suite.name}' has no scenarios: `scenarios` needs one or more")
+    if kinds is not None:
+        told = (event_faults(one, kinds, f"$.scenarios[{i}]") for i, one in enumerate(suite.scenarios))
+        if faults := list(chain.from_iterable(told)):
+            raise SpecError(f"{path}: {in_lines(faults)}")
     return suite
 
 

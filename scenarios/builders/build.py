@@ -22,9 +22,9 @@ from cosim.core.errors import SpecError
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.records.record import Record
-from cosim.spec.events import GROUPS
 from cosim.spec.scenario import City, Scenario, Suite, content_hash, write_suite
 from scenarios.builders import long_horizon, reactive
+from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from scenarios.execution.run import run_episode
 from sumo_nets.city.seeds import shipped_cities
@@ -89,8 +89,8 @@ def reactive_candidates(city: City, number: int) -> Iterator[Candidates]:
     """Every event in a city."""
     _, street_map = place(city)
     graph = WalkGraph(street_map)
-    for kind in GROUPS:
-        name = f"{kind}-{city.seed:03d}"
+    for kind in EVENT_KINDS.values():
+        name = f"{kind.name}-{city.seed:03d}"
         yield Candidates(
             name, number, partial(reactive.build_reactive, kind, city, street_map, graph, scenario_id=name)
         )

@@ -15,11 +15,12 @@ from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import Event, EventName
+from cosim.spec.events import Event
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
 from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of
 from scenarios.builders.hems import hem
+from scenarios.events import EVENT_KINDS
 
 HALF_WIDTH_M = 0.32
 IN_GROUPS = 0.3
@@ -30,7 +31,6 @@ ON_ROAD_M = 2.0
 
 CROSSING_EVERY_M = 160.0
 EVENT_EVERY_M = 90.0
-EVENT_KINDS: tuple[EventName, ...] = ("obstructing", "frontal")
 EVENT_WALKWAY_M = 3.0
 """Events take place on sidewalks at least this wide: there is room to pass."""
 
@@ -246,7 +246,7 @@ def draw_events(
             places.append((float(s_m), strip.width_m / 2))
     events: list[Event] = []
     next_s_m = 0.0
-    kinds = list(rng.permutation(np.array(EVENT_KINDS)))
+    kinds = rng.permutation([kind.name for kind in EVENT_KINDS.values() if kind.on_long_ways]).tolist()
     for s_m, half_width_m in places:
         if s_m < next_s_m:
             continue
@@ -254,7 +254,7 @@ def draw_events(
         events.append(
             Event(
                 id=f"e{len(events)}",
-                kind=str(kinds[len(events) % len(kinds)]),  # type: ignore[arg-type]
+                kind=kinds[len(events) % len(kinds)],
                 x_m=pose.x_m,
                 y_m=pose.y_m,
                 heading_rad=pose.heading_rad,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from types import MappingProxyType
+import zlib
 from typing import Literal, NamedTuple
 
 import msgspec
@@ -13,10 +12,11 @@ import shapely
 from shapely.geometry import LineString
 
 from cosim.core.errors import MapError, SpecError
-from cosim.core.geometry import Floats, Polyline
+from cosim.core.geometry import Floats, Polyline, Pose
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import GROUPS, Event, EventName
+from cosim.spec.event_kind import EventKind, SidewalkLayout
+from cosim.spec.events import Event
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.drawing import events_along, first_that_fits
 from scenarios.builders.long_horizon import route_crossings
@@ -33,66 +33,68 @@ ENDS_CLEAR_M = 6.0
 BEND_M = 0.15
 _SPEEDS_MPS = (1.1, 1.65)
 """Walking speeds of the paper."""
-OPEN_M = 1.25
-"""Width that a queue leaves beside it."""
-GROUP_M = 1.95
-"""Half the width of a sidewalk on which one can pass round a group of talkers in its middle."""
 
 
-class _Layout(NamedTuple):
-    """Where things are along a way. way_m: its length, shortest and longest; event_m: from the start to the event's
-    place, nearest and farthest; half_width_m: least half of the sidewalk's width."""
+class _EventSpot(NamedTuple):
+    """A way and where the event is on it. route: (N, 2) m; half_width_m, half_length_m: see `Event`."""
 
-    way_m: tuple[float, float]
-    event_m: tuple[float, float]
-    half_width_m: float = 1.3
-
-
-LAYOUTS: Mapping[EventName, _Layout] = MappingProxyType(
-    {
-        "obstructing": _Layout((18.0, 20.0), (11.0, 13.0)),
-        "conversing": _Layout((18.0, 20.0), (11.5, 13.0), GROUP_M),
-        "queueing": _Layout((18.0, 20.0), (11.0, 13.0), 1.4),
-        "gesturing": _Layout((18.0, 20.0), (11.0, 13.0)),
-        "frontal": _Layout((18.0, 20.0), (21.0, 22.0)),
-        "lateral": _Layout((15.0, 20.0), (8.0, 11.0)),
-        "overtaking": _Layout((18.0, 20.0), (1.5, 3.0), 1.4),
-        "ped_crossing": _Layout((10.0, 20.0), (0.0, 0.0)),
-    }
-)
-"""An event lies farther from the start than its trigger reaches, so that it triggers on the way."""
+    route: Floats
+    pose: Pose
+    route_s_m: float
+    half_width_m: float
+    half_length_m: float = 0.0
+    crossings: tuple[RouteCrossing, ...] = ()
 
 
 def build_reactive(
-    kind: EventName, place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str
+    kind: EventKind, place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str
 ) -> Scenario:
     """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is found."""
-    rng = np.random.default_rng([seed, place.seed, 0x4EAC7, sorted(GROUPS).index(kind)])
-    wanted = "crossing" if kind == "ped_crossing" else "sidewalk"
+    rng = np.random.default_rng([seed, place.seed, 0x4EAC7, zlib.crc32(kind.name.encode())])
+    wanted = "crossing" if kind.layout is None else "sidewalk"
     even = sorted(graph.main_strips - street_map.steep)
     strips = [street_map.strips[s] for s in even if street_map.strips[s].kind == wanted]
     if not strips:
-        raise MapError(f"map '{street_map.name}' has no {wanted} for '{kind}'")
+        raise MapError(f"map '{street_map.name}' has no {wanted} for '{kind.name}'")
 
     def draw() -> Scenario:
-        strip = strips[int(rng.integers(len(strips)))]
-        if kind == "ped_crossing":
-            return _over_crossing(place, street_map, strip, rng, seed, scenario_id)
-        return _along_sidewalk(kind, place, street_map, strip, rng, seed, scenario_id)
+        strip, layout = strips[int(rng.integers(len(strips)))], kind.layout
+        at = _over_crossing(street_map, strip, rng) if layout is None else _along_sidewalk(layout, strip, rng)
+        bare = events_along(
+            Polyline(at.route),
+            at.crossings,
+            place,
+            street_map,
+            suite="reactive",
+            seed=seed,
+            scenario_id=scenario_id,
+            time_limit_s=_LIMIT_S,
+        )
+        event = _event_at(kind, at, rng)
+        return msgspec.structs.replace(bare, events=(event,), crowd=CROWD, ends_on_failure=True, ends_at=kind.ends_at)
 
-    return first_that_fits(draw, f"no place for '{kind}' on '{street_map.name}' with seed {seed}")
+    return first_that_fits(draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}")
 
 
-def _along_sidewalk(
-    kind: EventName,
-    place: Place,
-    street_map: StreetMap,
-    strip: Strip,
-    rng: np.random.Generator,
-    seed: int,
-    scenario_id: str,
-) -> Scenario:
-    layout = LAYOUTS[kind]
+def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator) -> Event:
+    fewest, most = kind.people
+    people = int(rng.integers(fewest, most + 1)) if kind.group is None else kind.group(at.half_width_m, rng)
+    return Event(
+        id="e0",
+        kind=kind.name,
+        x_m=at.pose.x_m,
+        y_m=at.pose.y_m,
+        heading_rad=at.pose.heading_rad,
+        route_s_m=at.route_s_m,
+        half_width_m=at.half_width_m,
+        half_length_m=at.half_length_m,
+        people=people,
+        speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
+        side=1 if rng.random() < 0.5 else -1,
+    )
+
+
+def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator) -> _EventSpot:
     half_m = strip.width_m / 2
     if half_m < layout.half_width_m:
         raise SpecError("sidewalk too narrow")
@@ -111,34 +113,10 @@ def _along_sidewalk(
         raise SpecError("sidewalk not straight")
     steps = np.append(np.arange(0.0, way_m - 0.5, 1.0), way_m)
     route = np.round([chord.at(float(s)).xy for s in steps], 3)
-    pose = chord.at(min(event_m, chord.length_m))
-    side: Literal[-1, 1] = 1 if rng.random() < 0.5 else -1
-    event = Event(
-        id="e0",
-        kind=kind,
-        x_m=pose.x_m,
-        y_m=pose.y_m,
-        heading_rad=pose.heading_rad,
-        route_s_m=event_m,
-        half_width_m=half_m,
-        people=_group(kind, half_m, rng),
-        speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
-        side=side,
-    )
-    return _scenario(place, street_map, route, event, (), seed, scenario_id)
+    return _EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
 
 
-def _group(kind: EventName, half_m: float, rng: np.random.Generator) -> int:
-    """How many people: talkers as drawn; a queue as long as leaves OPEN_M beside it, past the middle."""
-    fewest, most = GROUPS[kind]
-    if kind == "queueing":
-        return max(fewest, min(most, int((2 * half_m - OPEN_M - 0.6) / 0.65) + 1))
-    return int(rng.integers(fewest, most + 1))
-
-
-def _over_crossing(
-    place: Place, street_map: StreetMap, strip: Strip, rng: np.random.Generator, seed: int, scenario_id: str
-) -> Scenario:
+def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator) -> _EventSpot:
     leave: Literal[0, 1] = 1 if rng.random() < 0.5 else 0
     if not 5.0 <= strip.length_m <= 12.0 or None in strip.corners:
         raise SpecError("crossing too short or too long")
@@ -148,32 +126,19 @@ def _over_crossing(
     route = Polyline(np.round(_straight_over(street_map, ends), 3)).resampled(0.99)
     route = Polyline(np.round(route.points, 3))
     crossings = route_crossings(street_map, route, [Port(strip.id, 0 if leave else 1), Port(strip.id, leave)])
-    middle_m = 0.5 * (crossings[0].enter_s_m + crossings[0].leave_s_m)
-    pose = route.at(middle_m)
-    events_along = ends[1] - ends[0]
-    event = Event(
-        id="e0",
-        kind="ped_crossing",
-        x_m=pose.x_m,
-        y_m=pose.y_m,
-        heading_rad=math.atan2(events_along[1], events_along[0]),
-        route_s_m=middle_m,
-        half_width_m=strip.width_m / 2,
-        half_length_m=0.5 * (crossings[0].leave_s_m - crossings[0].enter_s_m),
-        people=int(rng.integers(2, GROUPS["ped_crossing"][1] + 1)),
-        speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
-        side=1 if rng.random() < 0.5 else -1,
-    )
-    return _scenario(place, street_map, route.points, event, crossings, seed, scenario_id)
+    enter_m, leave_m = crossings[0].enter_s_m, crossings[0].leave_s_m
+    middle_m, (along_x, along_y) = 0.5 * (enter_m + leave_m), ends[1] - ends[0]
+    pose = route.at(middle_m)._replace(heading_rad=math.atan2(along_y, along_x))
+    return _EventSpot(route.points, pose, middle_m, strip.width_m / 2, 0.5 * (leave_m - enter_m), crossings)
 
 
 def _straight_over(street_map: StreetMap, ends: Floats) -> Floats:
     """(2, 2) m: a way straight over a crosswalk, from before its first end to beyond its second, as far as one can walk
     straight on there: who only drives straight ahead stays on it. Raises SpecError when that is too short."""
-    events_along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
+    along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     walkable = street_map.walkable_near(shapely.buffer(LineString(ends), BESIDE_CROSSING_M[1] + 1.0))
     reached = []
-    for end, outward in ((ends[0], -events_along), (ends[1], events_along)):
+    for end, outward in ((ends[0], -along), (ends[1], along)):
         for far_m in np.arange(BESIDE_CROSSING_M[1], BESIDE_CROSSING_M[0] - 1e-9, -0.25):
             beyond = shapely.buffer(LineString([end, end + far_m * outward]), _ROOM_M)
             if shapely.covers(walkable, beyond):
@@ -184,31 +149,3 @@ def _straight_over(street_map: StreetMap, ends: Floats) -> Floats:
     if np.hypot(*(reached[1] - reached[0])) < _SHORTEST_M:
         raise SpecError("way over the crossing too short")
     return np.array(reached)
-
-
-def _scenario(
-    place: Place,
-    street_map: StreetMap,
-    route: Floats,
-    event: Event,
-    crossings: tuple[RouteCrossing, ...],
-    seed: int,
-    scenario_id: str,
-) -> Scenario:
-    bare = events_along(
-        Polyline(route),
-        crossings,
-        place,
-        street_map,
-        suite="reactive",
-        seed=seed,
-        scenario_id=scenario_id,
-        time_limit_s=_LIMIT_S,
-    )
-    return msgspec.structs.replace(
-        bare,
-        events=(event,),
-        crowd=CROWD,
-        ends_on_failure=True,
-        ends_at="stop" if event.kind == "gesturing" else "goal",
-    )

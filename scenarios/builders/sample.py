@@ -14,9 +14,10 @@ from cosim.core.errors import MapError, SpecError, unknown
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.events import GROUPS, EventName
+from cosim.spec.event_kind import EventKind, EventKinds
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.builders import long_horizon, reactive
+from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.maps.place_names import place_called
 
@@ -28,26 +29,32 @@ _SAMPLE_M = 20.0
 
 
 def suite_on_map(
-    kind: str, called: str, seed: int, count: int | None, roughness: float = 0.0, events: Sequence[str] = ()
+    kind: str,
+    called: str,
+    seed: int,
+    count: int | None,
+    roughness: float = 0.0,
+    events: Sequence[str] = (),
+    kinds: EventKinds = EVENT_KINDS,
 ) -> Suite:
     """A suite drawn on a place, by whatever the user calls it; the same arguments and net give the same suite.
 
     count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one of each by default.
     events: which of them; those for which the place has no room are left out, and the description says so, unless they
     were asked for. Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
-    roughness: of the ground, from 0 (flat) to 1.
+    roughness: of the ground, from 0 (flat) to 1. kinds: the table of events that there are.
 
     Raises UsageError for another kind of suite, and whatever the place or the builder has to refuse.
     """
     if kind not in _KINDS:
         raise unknown("suite for --map", kind, _KINDS)
     for event in events:
-        if event not in GROUPS:
-            raise unknown("event", event, GROUPS)
+        if event not in kinds:
+            raise unknown("event", event, kinds)
     where = place_called(called, roughness)
     _, street_map = place(where)
     name = where.map if isinstance(where, CityMap) else where.name
-    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed)
+    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed, kinds)
     scenarios, left_out = drawn.long(count or 1) if kind == "long-horizon" else drawn.reactive(count, events)
     return Suite(
         name=kind,
@@ -65,6 +72,7 @@ class _Drawn(NamedTuple):
     graph: WalkGraph
     name: str
     seed: int
+    kinds: EventKinds
 
     def long(self, count: int) -> tuple[list[Scenario], list[str]]:
         """So many long-horizon scenarios; nothing is left out."""
@@ -75,7 +83,7 @@ class _Drawn(NamedTuple):
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
         """So many reactive scenarios, their events in turn, and a sentence for each event there is no room for."""
-        kinds = [kind for kind in GROUPS if kind in asked or not asked]
+        kinds = [kind for kind in self.kinds.values() if kind.name in asked or not asked]
         found: list[Scenario] = []
         left_out: list[str] = []
         for seed in itertools.count(self.seed):
@@ -86,7 +94,7 @@ class _Drawn(NamedTuple):
                     if asked:
                         raise
                     kinds.remove(kind)
-                    left_out.append(f"No '{kind}': {refusal}.")
+                    left_out.append(f"No '{kind.name}': {refusal}.")
                 if count is not None and len(found) == count:
                     return found, left_out
             if count is None or not kinds:
@@ -95,8 +103,8 @@ class _Drawn(NamedTuple):
             raise SpecError(f"no reactive scenario fits on '{self.name}': {' '.join(left_out)}")
         return found, left_out
 
-    def _one(self, kind: EventName, seed: int) -> Scenario:
-        scenario_id = f"{kind}-{self.name}-{seed:03d}"
+    def _one(self, kind: EventKind, seed: int) -> Scenario:
+        scenario_id = f"{kind.name}-{self.name}-{seed:03d}"
         return reactive.build_reactive(kind, self.where, self.street_map, self.graph, seed, scenario_id)
 
 

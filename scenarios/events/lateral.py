@@ -11,38 +11,36 @@ from typing import Final
 
 import msgspec
 
-from cosim.core.state import Doing
+from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
-from scenarios.events.behavior import Behavior, ahead
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 
-LATERAL_TRIGGER_M: Final = 4.0
 SLOWEST_MPS: Final = 0.2
 _FASTEST_MPS: Final = 2.0
 """A robot that stands is crossed before at the slowest pace; nobody runs faster than this."""
 
 
-def _begin(event: Event) -> tuple[Walker, ...]:
-    return (walker_at(event, 0.0, event.side * edge_m(event), -event.side * math.pi / 2),)
+def _begin(event: Event, number: int) -> Walker:
+    return walker_at(event, 0.0, event.side * edge_m(event), -event.side * math.pi / 2)
 
 
-def _act(event: Event, state: EventState, query: EventQuery) -> EventState:
-    (walker,) = state.walkers
-    sight = sight_of(event, 0, query)
+def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
+    walker, sight = state.walkers[number], sight_of(event, number, query)
+    if state.phase == "over":
+        return walked_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
     if walker.aim_rad is None or walker.pace_mps is None:
         aim_rad, pace_mps = _course(event, walker, query)
         walker = msgspec.structs.replace(walker, aim_rad=aim_rad, pace_mps=pace_mps)
         assert walker.aim_rad is not None and walker.pace_mps is not None
+    return pressed_on(walker, walker.aim_rad, walker.pace_mps, sight)
+
+
+def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
+    (walker,) = state.walkers
     dx, dy = walker.x_m - event.x_m, walker.y_m - event.y_m
     left_m = -dx * math.sin(event.heading_rad) + dy * math.cos(event.heading_rad)
-    across = -event.side * left_m >= edge_m(event)
-    if state.phase == "acting" and (across or gave_up(walker, query)):
-        state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
-    if state.phase == "over":
-        away_rad = event.heading_rad + math.pi
-        return msgspec.structs.replace(state, walkers=(walked_on(walker, away_rad, event.speed_mps, sight),))
-    return msgspec.structs.replace(state, walkers=(pressed_on(walker, walker.aim_rad, walker.pace_mps, sight),))
+    return -event.side * left_m >= edge_m(event) or gave_up(walker, query)
 
 
 def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, float]:
@@ -72,8 +70,11 @@ def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[floa
     return query.robot_heading_rad + towards * math.pi / 2, min(max(pace_mps, SLOWEST_MPS), _FASTEST_MPS)
 
 
-def _doing(event: Event, state: EventState, number: int) -> Doing:
-    return "stand"
-
-
-LATERAL: Final = Behavior(ahead(LATERAL_TRIGGER_M), _begin, _act, _doing)
+LATERAL: Final = EventKind(
+    name="lateral",
+    layout=SidewalkLayout((15.0, 20.0), (8.0, 11.0)),
+    trigger_m=4.0,
+    begin=_begin,
+    step=_step,
+    ends=_ends,
+)

@@ -3,20 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from types import MappingProxyType
 
 import msgspec
 
 from cosim.core.errors import SpecError
 from cosim.core.state import PersonKind
-from cosim.spec.events import Actor, Event, EventName, EventQuery, EventReply, EventState
-from scenarios.events.behavior import Behavior
-from scenarios.events.crossing import PED_CROSSING
-from scenarios.events.frontal import FRONTAL
-from scenarios.events.lateral import LATERAL
-from scenarios.events.overtaking import OVERTAKING
-from scenarios.events.standing import CONVERSING, GESTURING, OBSTRUCTING, QUEUEING
+from cosim.spec.event_kind import EventKind, EventKinds
+from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
+from scenarios.events.table import EVENT_KINDS
 
 SHOWN_AHEAD_M = 60.0
 SHOWN_BEHIND_M = 30.0
@@ -25,48 +19,48 @@ SHOWN_BEHIND_M = 30.0
 LEAVES_M = 15.0
 """Those whose event is over are gone for good when the robot is this far from all of them: out of its sight."""
 
-BEHAVIORS: Mapping[EventName, Behavior] = MappingProxyType(
-    {
-        "obstructing": OBSTRUCTING,
-        "conversing": CONVERSING,
-        "queueing": QUEUEING,
-        "frontal": FRONTAL,
-        "lateral": LATERAL,
-        "overtaking": OVERTAKING,
-        "ped_crossing": PED_CROSSING,
-        "gesturing": GESTURING,
-    }
-)
 
-
-def react(query: EventQuery) -> EventReply:
-    """One tick of every event. A pure function of the query. Raises SpecError when states and events do not match."""
-    states = query.states or tuple(_waiting(event) for event in query.events)
+def react(query: EventQuery, kinds: EventKinds = EVENT_KINDS) -> EventReply:
+    """One tick of every event. A pure function of query and table. Raises SpecError when states and events do not
+    match, or an event is not of the table."""
+    if strange := sorted({event.kind for event in query.events} - kinds.keys()):
+        raise SpecError(f"event '{strange[0]}' is none of {', '.join(kinds)}")
+    rows = [kinds[event.kind] for event in query.events]
+    states = query.states or tuple(map(_waiting, rows, query.events))
     if [len(s.walkers) for s in states] != [event.people for event in query.events]:
         raise SpecError(f"{len(query.events)} events came with {len(states)} states, or with other people")
-    new = tuple(_advance(event, state, query) for event, state in zip(query.events, states, strict=True))
+    told = list(zip(rows, query.events, states, strict=True))
+    new = tuple(_advance(kind, event, state, query) for kind, event, state in told)
     actors = tuple(
         actor
-        for event, before, after in zip(query.events, states, new, strict=True)
+        for (kind, event, before), after in zip(told, new, strict=True)
         if _present(event, after, query)
-        for actor in _shown(event, before, after, query)
+        for actor in _shown(kind, event, before, after, query)
     )
     return EventReply(episode=query.episode, tick=query.tick, states=new, actors=actors)
 
 
-def behavior_of(event: Event) -> Behavior:
-    """The behaviour of an event's kind."""
-    return BEHAVIORS[event.kind]
+def _waiting(kind: EventKind, event: Event) -> EventState:
+    walkers = tuple(kind.begin(event, number) for number in range(event.people))
+    return EventState(phase="waiting", since_tick=0, walkers=walkers)
 
 
-def _waiting(event: Event) -> EventState:
-    return EventState(phase="waiting", since_tick=0, walkers=behavior_of(event).begin(event))
+def _triggered_m(trigger_m: float | None, event: Event, query: EventQuery) -> float | None:
+    """Metres along the route from the robot to the event's place, once it begins; None before."""
+    gap_m = event.route_s_m - query.route_s_m
+    if trigger_m is None:
+        begins = abs(gap_m) <= event.half_length_m
+    elif trigger_m >= 0.0:
+        begins = 0.0 <= gap_m <= trigger_m
+    else:
+        step_m = max(query.robot_v_mps, 0.0) * query.tick_ms / 1000
+        begins = trigger_m - step_m <= gap_m < step_m + trigger_m
+    return gap_m if begins else None
 
 
-def _advance(event: Event, state: EventState, query: EventQuery) -> EventState:
-    behavior = behavior_of(event)
+def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery) -> EventState:
     if state.phase == "waiting":
-        gap_m = behavior.trigger(event, query)
+        gap_m = _triggered_m(kind.trigger_m, event, query)
         if gap_m is None:
             return state
         state = msgspec.structs.replace(
@@ -78,22 +72,23 @@ def _advance(event: Event, state: EventState, query: EventQuery) -> EventState:
         math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M for w in state.walkers
     ):
         return msgspec.structs.replace(state, phase="gone", since_tick=query.tick)
-    return _timed(state, behavior.act(event, state, query), query)
+    if state.phase == "acting" and kind.ends(event, state, query):
+        state = msgspec.structs.replace(state, phase="over", since_tick=query.tick)
+    after = (kind.step(event, state, number, query) for number in range(event.people))
+    walkers = tuple(_timed(old, new, query.tick_ms) for old, new in zip(state.walkers, after, strict=True))
+    return msgspec.structs.replace(state, walkers=walkers)
 
 
-def _timed(before: EventState, after: EventState, query: EventQuery) -> EventState:
-    """The state with the velocities of this tick's steps in it."""
-    walkers = []
-    for old, new in zip(before.walkers, after.walkers, strict=True):
-        vx, vy = (new.x_m - old.x_m) * 1000 / query.tick_ms, (new.y_m - old.y_m) * 1000 / query.tick_ms
-        same = (vx, vy) == (new.vx_mps, new.vy_mps)
-        walkers.append(new if same else msgspec.structs.replace(new, vx_mps=vx, vy_mps=vy))
-    return msgspec.structs.replace(after, walkers=tuple(walkers))
+def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:
+    """A walker after its step, with the velocity of it."""
+    vx, vy = (new.x_m - old.x_m) * 1000 / tick_ms, (new.y_m - old.y_m) * 1000 / tick_ms
+    return new if (vx, vy) == (new.vx_mps, new.vy_mps) else msgspec.structs.replace(new, vx_mps=vx, vy_mps=vy)
 
 
-def _shown(event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:
+def _shown(kind: EventKind, event: Event, before: EventState, after: EventState, query: EventQuery) -> list[Actor]:
+    pose = kind.pose if after.phase == "acting" else "stand"
     actors = []
-    for number, (name, old, new) in enumerate(zip(event.names, before.walkers, after.walkers, strict=True)):
+    for name, old, new in zip(event.names, before.walkers, after.walkers, strict=True):
         moved_m = math.hypot(new.x_m - old.x_m, new.y_m - old.y_m)
         actors.append(
             Actor(
@@ -102,8 +97,9 @@ def _shown(event: Event, before: EventState, after: EventState, query: EventQuer
                 y_m=new.y_m,
                 heading_rad=new.heading_rad,
                 speed_mps=moved_m * 1000 / query.tick_ms,
-                doing=behavior_of(event).doing(event, after, number) if moved_m < 1e-6 else "walk",
+                doing=pose if moved_m < 1e-6 else "walk",
                 kind=PersonKind.EVENT,
+                age=kind.age,
             )
         )
     return actors

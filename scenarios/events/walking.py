@@ -34,6 +34,11 @@ def spot(event: Event, along_m: float, left_m: float) -> tuple[float, float]:
     return event.x_m + cos * along_m - sin * left_m, event.y_m + sin * along_m + cos * left_m
 
 
+def along_m(event: Event, x_m: float, y_m: float) -> float:
+    """Metres of a point of the world along the event's heading, from its place."""
+    return math.cos(event.heading_rad) * (x_m - event.x_m) + math.sin(event.heading_rad) * (y_m - event.y_m)
+
+
 def edge_m(event: Event) -> float:
     """How far from the middle one can stand with both shoulders on the sidewalk."""
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)

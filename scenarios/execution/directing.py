@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Final
 
@@ -26,8 +26,9 @@ from bridge.director import RemoteDirector, Waiting, serve_director
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError
 from cosim.episode.ports import Director
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import Outside
-from scenarios.events import react
+from scenarios.events import EVENT_KINDS, react
 
 RETRY_S: Final = 0.2
 LEFT_S: Final = 60.0
@@ -37,20 +38,22 @@ _SOCKET: Final = "hub.sock"
 _OURS: Final = ("cosim.", "scenarios.")
 
 
-def director_of(episode: str, outside: Outside | None, waiting: Waiting) -> AbstractContextManager[Director]:
+def director_of(
+    episode: str, outside: Outside | None, waiting: Waiting, kinds: EventKinds = EVENT_KINDS
+) -> AbstractContextManager[Director]:
     """The director of an episode's event pedestrians: the one outside, or one of its own."""
-    return directed(episode) if outside is None else directed_by(outside, waiting, episode)
+    return directed(episode, kinds) if outside is None else directed_by(outside, waiting, episode)
 
 
 @contextmanager
-def directed(episode: str) -> Iterator[Director]:
+def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
     """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
     with ExitStack() as stack:
         _sweep(Path(tempfile.gettempdir()))
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=_FOLDER))
         endpoint = f"unixsock-stream/{folder}/{_SOCKET}"
         key = keys.director("local", keys.chunk(episode))
-        serve_director(stack.enter_context(Session.hub(endpoint)), key, react)
+        serve_director(stack.enter_context(Session.hub(endpoint)), key, partial(react, kinds=kinds))
         yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
 
 

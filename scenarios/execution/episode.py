@@ -31,8 +31,10 @@ from cosim.episode.ports import CameraSpec, Eyes, Manifest, Observation
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.records.record import Record, begun
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
+from scenarios.events import EVENT_KINDS
 from scenarios.execution.on_air import OnAir
 from scenarios.execution.wiring import StagedScenario, staged
 from sumo_nets.crowd.demand_log import Entrances
@@ -50,7 +52,8 @@ class Episode:
     entering and are closed whatever happens. One at a time in a process, because SUMO runs once in each.
 
     watches: told every tick. waiting: told what the episode waits for when it stands still. through: may
-    put stopwatches or stand-ins before the engines, which have started and not begun.
+    put stopwatches or stand-ins before the engines, which have started and not begun. kinds: the table of events that
+    there may be.
 
     Raises UsageError when it is used out of turn, PolicyError for an answer that is no command, EngineError when an
     engine fails or runs already, and what its place raises.
@@ -75,11 +78,12 @@ class Episode:
         watches: Sequence[Watch] = (),
         waiting: Callable[[str], None] = unheard,
         through: Callable[[StagedScenario], None] | None = None,
+        kinds: EventKinds = EVENT_KINDS,
     ) -> None:
         self.scenario, self.manifest, self.options = scenario, manifest, options
         self.clock = Clock.for_rate(manifest.rate_hz)
         self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source)
-        self._watches, self._waiting, self._through = list(watches), waiting, through
+        self._watches, self._waiting, self._through, self._kinds = list(watches), waiting, through, kinds
         self._began_s = time.perf_counter()
         self._setup_s = 0.0
         self._stack = ExitStack()
@@ -93,7 +97,9 @@ class Episode:
         if self._setup_s:
             raise UsageError("this Episode was used before: make a new Episode for every run of a scenario")
         with ExitStack() as stack:
-            stage = stack.enter_context(staged(self.scenario, self.manifest, self.options, self.clock, self._waiting))
+            stage = stack.enter_context(
+                staged(self.scenario, self.manifest, self.options, self.clock, self._waiting, self._kinds)
+            )
             if self._through is not None:
                 self._through(stage)
             if self.options.live is not None:

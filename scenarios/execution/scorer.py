@@ -13,15 +13,18 @@ from cosim.judge.referee import Failure, Referee, Verdict
 from cosim.judge.traffic import Roadway
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.records.record import Record, Recorder, TriggeredEvent
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.scenario import Scenario
 
 
 class Scorer:
-    """Takes in the Steps of one episode, in order. area: where the robot may be; footprint_m: its length and width."""
+    """Takes in the Steps of one episode, in order. kinds: the table of its events; area: where the robot may be;
+    footprint_m: its length and width."""
 
     def __init__(
         self,
         scenario: Scenario,
+        kinds: EventKinds,
         street_map: StreetMap,
         area: WalkableArea,
         footprint_m: tuple[float, float],
@@ -30,7 +33,7 @@ class Scorer:
         self._scenario = scenario
         self._referee = Referee(scenario, area, footprint_m, clock)
         self._recorder = Recorder(clock.tick_s)
-        self._monitor = Witness(scenario, clock.tick_ms)
+        self._monitor = Witness(scenario, kinds, clock.tick_ms)
         self._traffic = Roadway(street_map, clock.tick_s)
         self._failures: list[Failure] = []
         self._red_lights = 0

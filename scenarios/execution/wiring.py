@@ -11,14 +11,17 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
+from cosim.core.errors import SpecError
 from cosim.episode.control import Limits
 from cosim.episode.loop import Moment, Parts
 from cosim.episode.ports import CameraSpec, Eyes, Manifest, Privileged
 from cosim.place import overlay
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import Barrier, Scenario
+from cosim.spec.scenario import Barrier, Scenario, event_faults
+from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.robots import robot
 from physics.street.furniture import Prop, footprints
@@ -64,8 +67,11 @@ def staged(
     options: EpisodeOptions,
     clock: Clock,
     waiting: Callable[[str], None],
+    kinds: EventKinds,
 ) -> Iterator[StagedScenario]:
     """Start every engine of a scenario; all are closed at the end, whatever happened."""
+    if faults := list(event_faults(scenario, kinds)):
+        raise SpecError(f"scenario '{scenario.id}': {in_lines(faults)}")
     _, street_map = place(scenario.place)
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     walkable = street_map.walkable_near(around)
@@ -80,7 +86,7 @@ def staged(
         camera, renderer = None, NO_RENDERER
         if manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
-        director = stack.enter_context(director_of(scenario.id, options.director, waiting))
+        director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
         footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
@@ -90,7 +96,7 @@ def staged(
             parts=Parts(world, crowd, injected, camera),
             limits=Limits(),
             renderer=renderer,
-            scorer=Scorer(scenario, street_map, WalkableArea(walkable), world.footprint_m, clock),
+            scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), world.footprint_m, clock),
             known=partial(known, scenario, free),
             eyes=eyes,
             injected=injected,

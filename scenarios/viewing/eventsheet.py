@@ -6,9 +6,8 @@ Everything here comes from `trajectory.npz` and the spec; nothing from what a di
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Final
 
 import numpy as np
@@ -18,20 +17,10 @@ from cosim.core.geometry import Floats, wrap_angles
 from cosim.episode.log import Log
 from cosim.records.record import Record
 from cosim.records.run_folder import read_records
-from cosim.spec.events import Event, EventName
+from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import Event
 from cosim.spec.scenario import Scenario, read_suite
-from scenarios.events import frontal, lateral, overtaking, standing
-
-TRIGGERS_M: Final[Mapping[EventName, float]] = MappingProxyType(
-    {
-        **dict.fromkeys(("obstructing", "conversing", "queueing", "gesturing"), standing.STANDING_TRIGGER_M),
-        "frontal": frontal.FRONTAL_TRIGGER_M,
-        "lateral": lateral.LATERAL_TRIGGER_M,
-        "overtaking": -overtaking.OVERTAKING_TRIGGER_M,
-    }
-)
-"""Where the robot is when an event triggers: metres before its place (negative: beyond it); `ped_crossing` at the edge
-of its crosswalk."""
+from scenarios.events import EVENT_KINDS
 
 STILL_M: Final = 1e-6
 LATE_M: Final = 0.005
@@ -41,18 +30,18 @@ COLUMNS: Final = (
 )  # fmt: skip
 
 
-def sheet_of_run(folder: Path) -> pd.DataFrame:
+def sheet_of_run(folder: Path, kinds: EventKinds = EVENT_KINDS) -> pd.DataFrame:
     """One row per person of each triggered event of a run, `COLUMNS`. Raises what reading a run raises."""
-    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
+    scenarios = {s.id: s for s in read_suite(folder / "scenarios.json", kinds).scenarios}
     rows = []
     for record in sorted(read_records(folder), key=lambda r: r.scenario):
         path = folder / "episodes" / record.scenario / "trajectory.npz"
         if record.status != "crashed" and path.exists():
-            rows += rows_of(scenarios[record.scenario], record, Log.load(path))
+            rows += rows_of(scenarios[record.scenario], record, Log.load(path), kinds)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 
 
-def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, ...]]:
+def rows_of(scenario: Scenario, record: Record, log: Log, kinds: EventKinds = EVENT_KINDS) -> list[tuple[object, ...]]:
     """The rows of an episode.
 
     trigger_m: metres along the route from the robot to the event's place at the trigger. error_m: how far that is
@@ -70,7 +59,9 @@ def rows_of(scenario: Scenario, record: Record, log: Log) -> list[tuple[object, 
         first = int(tracks[0, 0])
         before = max(first - 1, 0)
         trigger_m = event.route_s_m - float(log.route_s_m[before] if first else 0.0)
-        stated_m = TRIGGERS_M.get(event.kind, event.half_length_m)
+        stated_m = kinds[event.kind].trigger_m
+        if stated_m is None:
+            stated_m = event.half_length_m
         came_m = float(log.route_s_m[before] - log.route_s_m[before - 1]) if before else 0.0
         period_m = max(float(log.travelled_m[before]), came_m)
         for person in range(event.people):
@@ -101,20 +92,20 @@ def walked(event: Event, track: Floats, log: Log) -> tuple[float, float, float, 
     return float(np.median(far_m[moves]) / log.tick_s), where_m, math.degrees(angle), least_m
 
 
-def summary(sheet: pd.DataFrame) -> tuple[pd.DataFrame, pd.DataFrame]:
+def summary(sheet: pd.DataFrame, kinds: EventKinds = EVENT_KINDS) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Two tables with a row per kind of event: its triggers, and how its people walked and stood; ranges.
 
     off: triggers farther from what is stated than the robot's motion in a tick.
     """
     triggers, walks = [], []
-    stated: dict[str, str] = {kind: f"{metres:g}" for kind, metres in TRIGGERS_M.items()}
     for kind, part in sheet.groupby("kind", sort=False):
+        stated_m = kinds[str(kind)].trigger_m
         triggers.append(
             {
                 "event": kind,
                 "n": part["scenario"].str.split().str[0].nunique(),
                 "people": len(part),
-                "stated": stated.get(str(kind), "entry"),
+                "stated": "entry" if stated_m is None else f"{stated_m:g}",
                 "trigger m": _spread(part["trigger_m"]),
                 "error m": _spread(part["error_m"]),
                 "tick m": f"{part['period_m'].max():.3f}",

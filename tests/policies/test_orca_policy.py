@@ -19,8 +19,8 @@ from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, fores
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
 from cosim.policies.route import crossing_limit
-from cosim.spec.events import GROUPS, EventName
 from cosim.spec.scenario import City, CrowdSpec
+from scenarios.events import EVENT_KINDS
 
 CITY = City(seed=1, size_m=500.0)
 ROUTE = Polyline([(0.0, 0.0), (30.0, 0.0)])
@@ -123,9 +123,9 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
 @pytest.mark.engine
 @pytest.mark.parametrize(
     ("kind", "seed"),
-    [*((kind, 1) for kind in GROUPS), ("conversing", 2)],
+    [*((kind, 1) for kind in EVENT_KINDS), ("conversing", 2)],
 )
-def test_the_reference_solver_solves_every_event(kind: EventName, seed: int) -> None:
+def test_the_reference_solver_solves_every_event(kind: str, seed: int) -> None:
     """One scenario of each event, with real engines: triggered, seen, its rule kept, its end reached."""
     from cosim.place.walk_graph import WalkGraph
     from scenarios.builders.reactive import build_reactive
@@ -133,7 +133,7 @@ def test_the_reference_solver_solves_every_event(kind: EventName, seed: int) -> 
     from scenarios.execution.run import run_episode
 
     _, street_map = place(CITY)
-    whole = build_reactive(kind, CITY, street_map, WalkGraph(street_map), seed, kind)
+    whole = build_reactive(EVENT_KINDS[kind], CITY, street_map, WalkGraph(street_map), seed, kind)
     scenario = msgspec.structs.replace(whole, crowd=CrowdSpec(persons=10, radius_m=40.0, vehicles=4))
     record = run_episode(scenario, Orca()).record
     assert (record.status, record.failures) == ("done", ())
@@ -162,6 +162,6 @@ def test_driving_straight_on_fails_before_somebody_who_comes_towards_it() -> Non
 
     _, street_map = place(CITY)
     record = run_episode(
-        build_reactive("frontal", CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()
+        build_reactive(EVENT_KINDS["frontal"], CITY, street_map, WalkGraph(street_map), 1, "frontal"), Blind()
     ).record
     assert record.ended == "failure" and record.failures[0].other == "e0"

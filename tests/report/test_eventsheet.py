@@ -9,15 +9,16 @@ import pytest
 
 from cosim.episode.log import Log
 from cosim.records.record import Record
-from cosim.spec.events import Event, EventName
+from cosim.spec.events import Event
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from scenarios.events import EVENT_KINDS
 from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary
 from tests.conftest import Cosim
 
 TICK_S = 0.05
 
 
-def scenario_of(kind: EventName) -> Scenario:
+def scenario_of(kind: str) -> Scenario:
     """20 m along the x axis, the event at 12 m."""
     event = Event(
         id="e0", kind=kind, x_m=12.0, y_m=0.0, heading_rad=0.0, route_s_m=12.0, half_width_m=1.5, speed_mps=1.2
@@ -87,7 +88,7 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path
     fields = {"crowd": CrowdSpec(persons=4, radius_m=50.0, vehicles=0), "time_limit_s": 9.0}
     made = []
     for kind in ("frontal", "gesturing"):
-        whole = build_reactive(kind, city, street_map, graph, 1, kind)
+        whole = build_reactive(EVENT_KINDS[kind], city, street_map, graph, 1, kind)
         made.append(Scenario(**{name: getattr(whole, name) for name in Scenario.__struct_fields__} | fields))
     write_suite(Suite(name="tiny", version="1", scenarios=tuple(made)), tmp_path / "tiny.json")
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
 
 from cosim.core.errors import SpecError
-from cosim.spec.events import GROUPS, Actor, Event, EventName, EventQuery, EventReply, EventState
-from scenarios.events import BEHAVIORS, react
+from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState
+from scenarios.events import EVENT_KINDS, react
 from scenarios.events.frontal import COMMIT_M
 from scenarios.events.standing import QUEUE_M
 
@@ -20,7 +19,7 @@ TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
 
 
-def event(kind: EventName, **fields: object) -> Event:
+def event(kind: str, **fields: object) -> Event:
     """An event 50 m along a route on the x axis, on a sidewalk 4 m wide."""
     known = {"id": "e0", "kind": kind, "x_m": 50.0, "y_m": 0.0, "heading_rad": 0.0, "route_s_m": 50.0}
     known |= {"half_width_m": 2.0, "speed_mps": 1.2, "people": PEOPLE.get(kind, 1)}
@@ -61,7 +60,7 @@ def drive(
         ("lateral", 4.0), ("overtaking", -1.0), ("ped_crossing", 5.0),
     ],
 )  # fmt: skip
-def test_an_event_triggers_at_its_distance(kind: EventName, trigger_m: float) -> None:
+def test_an_event_triggers_at_its_distance(kind: str, trigger_m: float) -> None:
     """The trigger fires at the first tick at which the robot is within the distance of the paper's table, overtaking at
     the last one within it behind, a crossing at the end of its crosswalk."""
     track = drive(event(kind), 1100, 1.0)
@@ -115,7 +114,7 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
 
 def test_event_pedestrians_walk_no_faster_than_told_and_never_jump() -> None:
     """Between two ticks no actor moves farther than its speed allows."""
-    for kind in BEHAVIORS:
+    for kind in EVENT_KINDS:
         fastest = {"lateral": 2.0, "overtaking": 2.2}.get(kind, 1.2)
         states = [state for _, state, _ in drive(event(kind), 1500, 1.3)]
         for a, b in itertools.pairwise(states):
@@ -135,19 +134,8 @@ def test_the_director_is_stateless() -> None:
     assert restarted == again
 
 
-def test_every_kind_has_a_behaviour() -> None:
-    """All eight of the paper's table."""
-    assert set(BEHAVIORS) == set(get_args(EventName)) == set(GROUPS)
-
-
 def test_an_event_that_makes_no_sense_is_refused() -> None:
     """The message names the event, the field and what it may be."""
-    with pytest.raises(SpecError, match="'e0': people of 'conversing' must be 2 to 4, not 1"):
-        event("conversing", people=1)
-    with pytest.raises(SpecError, match="'e0': people of 'frontal' must be 1, not 2"):
-        event("frontal", people=2)
-    with pytest.raises(SpecError, match="half_length_m is the crosswalk's"):
-        event("ped_crossing", half_length_m=0.0)
     with pytest.raises(SpecError, match="ids of event pedestrians start with 'e'"):
         event("frontal", id="x1")
     with pytest.raises(SpecError, match="'ei-' begins the ids of injected pedestrians"):

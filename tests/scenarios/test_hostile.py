@@ -19,6 +19,7 @@ import pytest
 
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
+from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, WIDE, Cosim, Said
 from tests.scenarios.hostile import ACTS, FLOOD_BYTES, RESETS
 
@@ -96,7 +97,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("desk")
     city = City(seed=1, size_m=500.0)
     _, street_map = place(city)
-    whole = build_reactive("obstructing", city, street_map, WalkGraph(street_map), 0, "t")
+    whole = build_reactive(EVENT_KINDS["obstructing"], city, street_map, WalkGraph(street_map), 0, "t")
     crowd = CrowdSpec(persons=4, radius_m=50.0, vehicles=1)
     one = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=1.0, events=())
     for name, scenarios in (("hostile", [*EXPECTED]), ("pictures", ["honest", "blackens"])):

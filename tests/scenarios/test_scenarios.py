@@ -30,7 +30,7 @@ from scenarios.builders.build import Proof
 from scenarios.builders.long_horizon import build_long_horizon, on_road_m
 from scenarios.builders.sample import suite_on_map, thinned
 from scenarios.catalog import SUITES, load_suite, scenarios_chosen
-from scenarios.events import BEHAVIORS, react
+from scenarios.events import EVENT_KINDS, react
 from sumo_nets.maps.mapstore import read_map
 
 LONG = load_suite("long-horizon").scenarios
@@ -52,7 +52,7 @@ def test_the_reactive_suite_is_what_it_promises() -> None:
     whole = load_suite("reactive")
     cities = {scenario.place.name for scenario in whole.scenarios}
     assert len(cities) == 20
-    places = {kind: [s.place.name for s in whole.scenarios if s.events[0].kind == kind] for kind in BEHAVIORS}
+    places = {kind: [s.place.name for s in whole.scenarios if s.events[0].kind == kind] for kind in EVENT_KINDS}
     assert all(len(there) == 20 and set(there) == cities for there in places.values())
     assert [s.place.name for s in whole.scenarios] == sorted(
         (s.place.name for s in whole.scenarios), key=lambda name: int(name.rpartition("-")[2])
@@ -165,7 +165,7 @@ def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
     assert not [ring for ring in part.interiors if shapely.Polygon(ring).area > 0.25]
     assert shapely.covers(shapely.buffer(near, -1.0), part)
     assert WalkableArea(shapely.buffer(part, -0.3)).signed_distance(route.resampled(0.25).points).min() >= 0.0
-    assert {e.kind for e in scenario.events} <= set(BEHAVIORS)
+    assert {e.kind for e in scenario.events} <= set(EVENT_KINDS)
     for event in scenario.events:
         at = route.at(event.route_s_m)
         assert np.hypot(at.x_m - event.x_m, at.y_m - event.y_m) < 0.01

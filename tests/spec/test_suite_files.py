@@ -16,6 +16,7 @@ import pytest
 from cosim.core.errors import SpecError
 from cosim.spec.scenario import City, Suite, read_suite
 from scenarios.catalog import SUITES, load_suite
+from scenarios.events import EVENT_KINDS
 from tests.mutate_suites import fates, mutated, small_suite
 
 PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|nested too deep")
@@ -33,7 +34,7 @@ def refusal(path: Path, data: bytes | str) -> str:
     """What is said of a file with this content, the file's name taken away."""
     path.write_bytes(data if isinstance(data, bytes) else data.encode())
     with pytest.raises(SpecError) as told:
-        read_suite(path)
+        read_suite(path, EVENT_KINDS)
     message = str(told.value)
     assert message.startswith(f"{path}: ")
     return message.removeprefix(f"{path}: ")
@@ -46,7 +47,7 @@ def test_a_thousand_mutated_suites_are_read_or_refused_in_words(tmp_path: Path) 
     for seed in range(1000):
         path.write_bytes(mutated(whole, seed))
         try:
-            read_suite(path)
+            read_suite(path, EVENT_KINDS)
             accepted += 1
         except SpecError as error:
             told = str(error).removeprefix(f"{path}: ")
@@ -95,6 +96,9 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
     (("first", "events", 0, "half_width_m"), 1e9, "half_width_m must be in (0.3, 50], not 1000000000.0"),
     (("first", "events", 0, "hold_s"), -1, "event 'e0': hold_s must be in [0, 3600], not -1"),
     (("first", "events", 0, "id"), "e <x>", "event id 'e <x>': ids of event pedestrians start with 'e'"),
+    (("first", "events", 0, "kind"), "ambush", "Invalid enum value 'ambush' - at `$.scenarios[0].events[0].kind`. V"),
+    (("first", "events", 0, "people"), 2, "people of 'obstructing' must be 1, not 2 - at `$.scenarios[0].events[0]`"),
+    (("first", "events", 0, "half_length_m"), 2.0, "half_length_m is the crosswalk's: of 'ped_crossing', and of no"),
     (("first", "crowd", "persons"), 10**9, "crowd persons must be in [0, 1000], not 1000000000"),
     (("first", "crowd", "vehicles"), 10**9, "crowd vehicles must be in [0, 200], not 1000000000"),
     (("first", "light", "hour"), math.nan, "light hour must be in [0, 24], not nan - at `$.scenarios[0].light`"),

@@ -16,9 +16,9 @@ import msgspec
 import pytest
 
 from cosim.core.errors import MapError, SpecError, UsageError
-from cosim.spec.events import GROUPS
 from cosim.spec.scenario import City, CityMap
 from scenarios.builders.sample import suite_on_map
+from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.city.store import NET_NAME, write_city
 from sumo_nets.maps.mapstore import ABOUT, about_map, import_map, known_maps, map_net, maps_folder, read_map
@@ -139,8 +139,8 @@ def test_reactive_scenarios_are_drawn_where_there_is_room() -> None:
     """Events take turns over the seeds; those without room are left out and named, unless they were asked for."""
     whole = suite_on_map("reactive", "sumo-fkk-in", 0, None)
     kinds = [s.events[0].kind for s in whole.scenarios]
-    left_out = [kind for kind in GROUPS if f"No '{kind}'" in whole.description]
-    assert kinds and left_out and sorted([*kinds, *left_out]) == sorted(GROUPS)
+    left_out = [kind for kind in EVENT_KINDS if f"No '{kind}'" in whole.description]
+    assert kinds and left_out and sorted([*kinds, *left_out]) == sorted(EVENT_KINDS)
     some = suite_on_map("reactive", "sumo-fkk-in", 5, 3, events=kinds[:2])
     assert [s.events[0].kind for s in some.scenarios] == [kinds[0], kinds[1], kinds[0]]
     assert len({s.id for s in some.scenarios}) == 3 and all(s.place.net_hash for s in some.scenarios)

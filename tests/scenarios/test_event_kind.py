@@ -1,0 +1,127 @@
+"""A kind of event is a row: one that this file alone knows is drawn, read, directed, judged and shown."""
+
+from __future__ import annotations
+
+import ast
+import math
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+import pytest
+
+from cosim.core.errors import SpecError
+from cosim.core.state import Age, Command, PersonKind
+from cosim.episode.ports import Manifest
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.spec.event_kind import EventKind, EventKinds, SidewalkLayout
+from cosim.spec.events import Event, EventQuery, EventState, Walker
+from cosim.spec.scenario import City, CrowdSpec, read_suite, write_suite
+from scenarios.builders.sample import suite_on_map
+from scenarios.events import EVENT_KINDS
+from scenarios.events.sight import sight_of
+from scenarios.events.walking import edge_m, spot, walked_to, walker_at
+from scenarios.execution.episode import Episode
+from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary
+from sumo_nets.city.store import write_city
+from tests.conftest import ROOT
+
+TRIGGER_M = 7.0
+
+
+def begin(event: Event, number: int) -> Walker:
+    """Two of them, at either edge of the sidewalk."""
+    return walker_at(event, 0.0, (1 - 2 * number) * edge_m(event), math.pi)
+
+
+def change_sides(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
+    """To the other edge, and back when it is over; there they stand."""
+    side = (2 * number - 1) * (1 if state.phase == "acting" else -1)
+    goal = spot(event, 0.6 * number, side * edge_m(event))
+    return walked_to(state.walkers[number], *goal, event.speed_mps, sight_of(event, number, query))
+
+
+def after_three_seconds(event: Event, state: EventState, query: EventQuery) -> bool:
+    return (query.tick - state.since_tick) * query.tick_ms >= 3000
+
+
+SWAPPING = EventKind(
+    name="swapping",
+    people=(2, 2),
+    layout=SidewalkLayout((16.0, 18.0), (9.0, 10.0)),
+    trigger_m=TRIGGER_M,
+    begin=begin,
+    step=change_sides,
+    ends=after_three_seconds,
+    pose="phone",
+    age=Age.CHILD,
+    passed_round=True,
+)
+KINDS: EventKinds = EVENT_KINDS | {SWAPPING.name: SWAPPING}  # type: ignore[operator]
+
+
+def test_every_row_of_the_table_is_the_papers_and_triggers_on_the_way() -> None:
+    """Eight of them; the robot starts farther from an event's place than its trigger reaches."""
+    assert [*EVENT_KINDS] == [
+        "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing",
+    ]  # fmt: skip
+    for kind in EVENT_KINDS.values():
+        if kind.layout is not None:
+            assert kind.trigger_m is not None and abs(kind.trigger_m) < kind.layout.event_m[0]
+            assert kind.layout.event_m[0] - kind.trigger_m < kind.layout.way_m[0]
+        assert (kind.trigger_m is None) == (kind.layout is None) and 1 <= kind.people[0] <= kind.people[1]
+
+
+def test_a_kind_is_named_in_its_own_file_alone() -> None:
+    """Whatever else needs to know something of a kind reads its row: no other module of the product names one."""
+    named = [
+        f"{path.relative_to(ROOT)}: {node.value}"
+        for room in ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
+        for path in (ROOT / room).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Constant) and node.value in EVENT_KINDS and path.parent.name != "events"
+    ]
+    assert not named
+
+
+@pytest.mark.engine
+def test_an_event_that_a_test_alone_knows(tmp_path: Path) -> None:
+    """Its row is all that there is of it: sampled on a city, written, read, directed over Zenoh, triggered, monitored,
+    and in the sheet; without its row it is refused at every door."""
+    write_city(City(seed=1, size_m=500.0), tmp_path / "city")
+    drawn = suite_on_map("reactive", str(tmp_path / "city"), 3, 1, events=["swapping"], kinds=KINDS)
+    write_suite(drawn, tmp_path / "s.json")
+    (whole,) = read_suite(tmp_path / "s.json", KINDS).scenarios
+    with pytest.raises(SpecError, match=r"'swapping' - at `\$.scenarios\[0\].events\[0\].kind`. Valid choices: obstr"):
+        read_suite(tmp_path / "s.json", EVENT_KINDS)
+    few = CrowdSpec(persons=3, radius_m=40.0, vehicles=0)
+    scenario = msgspec.structs.replace(whole, crowd=few, time_limit_s=7.0)
+    manifest = Manifest("ahead", camera=None)
+    with pytest.raises(SpecError, match=f"scenario '{scenario.id}': .*'swapping'"), Episode(scenario, manifest):
+        pass
+
+    doing: set[tuple[str, ...]] = set()
+    phases = set()
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        people = step.street_after.people
+        pair = people.only(people.are(PersonKind.EVENT).nonzero()[0])
+        assert pair.age.tolist() == [Age.CHILD] * 2
+        doing.add(pair.doing)
+        phases.add(step.events.states[0].phase)
+
+    with Episode(scenario, manifest, watches=[watch], kinds=KINDS) as episode:
+        episode.reset()
+        while not episode.over:
+            episode.advance(Command(0.9 if episode.time_s < 3.5 else 0.0, 0.0))
+    record, log = episode.result()
+    (event,) = record.events
+    assert (record.status, event.kind, event.seen, event.rule_met) == ("done", "swapping", True, True), record.reason
+    assert event.trigger_distance_m == pytest.approx(TRIGGER_M, abs=0.06)
+    assert ("stand", "stand") in doing and ("walk", "walk") in doing and any("phone" in pair for pair in doing)
+    assert phases == {"waiting", "acting", "over"}
+    sheet = pd.DataFrame(rows_of(scenario, record, log, KINDS), columns=list(COLUMNS))
+    assert sheet["kind"].tolist() == ["swapping"] * 2
+    triggers, _ = summary(sheet, KINDS)
+    assert triggers[["event", "stated", "off"]].to_numpy().tolist() == [["swapping", "7", "0"]]
