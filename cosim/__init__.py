@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from cosim.policies.load import load_policy
     from cosim.records.record import Record
     from cosim.spec.options import EpisodeOptions
+    from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.catalog import load_suite
     from scenarios.execution.episode import Episode
@@ -42,9 +43,11 @@ __all__ = [
     "EpisodeOptions",
     "Log",
     "Manifest",
+    "Mount",
     "Observation",
     "Policy",
     "Record",
+    "Robot",
     "Scenario",
     "Suite",
     "load_policy",
@@ -60,9 +63,11 @@ _HOMES = {
     "EpisodeOptions": "cosim.spec.options",
     "Log": "cosim.episode.log",
     "Manifest": "cosim.episode.ports",
+    "Mount": "cosim.spec.robot",
     "Observation": "cosim.episode.ports",
     "Policy": "cosim.episode.ports",
     "Record": "cosim.records.record",
+    "Robot": "cosim.spec.robot",
     "Scenario": "cosim.spec.scenario",
     "Suite": "cosim.spec.scenario",
     "load_policy": "cosim.policies.load",

@@ -57,6 +57,15 @@ def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     return replace(whole, scenarios=scenarios, version=version)
 
 
+def with_robot(whole: Suite, robot: str) -> Suite:
+    """The suite with this robot in each scenario: another suite, whose version says so. Itself where it is there
+    already, or `robot` is "". Raises UsageError with the valid names."""
+    scenarios = tuple(scenario.driven_by(robot) for scenario in whole.scenarios)
+    if scenarios == whole.scenarios:
+        return whole
+    return msgspec.structs.replace(whole, scenarios=scenarios, version=f"{whole.version}-{robot}")
+
+
 def scenarios_chosen(
     whole: Suite, ids: Sequence[str] = (), episodes: int | None = None, kinds: Sequence[str] = ()
 ) -> tuple[Scenario, ...]:

@@ -16,6 +16,7 @@ from cosim.core.versions import versions
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.baselines import Straight
 from cosim.spec.events import EventQuery
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
 from scenarios.builders.long_horizon import build_long_horizon
@@ -56,7 +57,8 @@ def city() -> str:
 def bridge() -> str:
     query = EventQuery(
         episode="doctor", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0,
-        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
+        robot_v_mps=0.0, robot_w_radps=0.0, route_s_m=0.0, robot_length_m=COURIER.length_m,
+        robot_width_m=COURIER.width_m, events=(),
     )  # fmt: skip
     with directed("doctor") as director:
         director.react(query)

@@ -18,7 +18,7 @@ from cosim.cli.board import Board
 from cosim.cli.city import city_app
 from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
-from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, Choice, camera_here, export, film, look
+from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, ROBOT_HELP, Choice, camera_here, export, film, look
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
@@ -61,6 +61,7 @@ def common(
     "`cosim run long-horizon --policy route --episodes 2`  \n"
     "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
     "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
+    "`cosim run long-horizon --robot scout --episodes 2`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
@@ -70,6 +71,7 @@ def common(
 def run_command(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
@@ -116,8 +118,9 @@ def run_command(
     from cosim.records.run_folder import RunFolder
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
+    from cosim.spec.robot import COURIER, robot_called
     from scenarios.builders.fits import LOOKING, check_places
-    from scenarios.catalog import load_suite, scenarios_chosen, with_crowd
+    from scenarios.catalog import load_suite, scenarios_chosen, with_crowd, with_robot
     from scenarios.execution.asked import Patience
     from scenarios.execution.messages import Hello
     from scenarios.execution.pace import announcement, remembered
@@ -129,12 +132,14 @@ def run_command(
         from scenarios.builders.sample import suite_on_map
 
         with doing(f"drawing routes on {map_name}"):
-            whole = suite_on_map(suite, map_name, seed, episodes, roughness or 0.0, event or ())
+            driven_by = robot_called(robot or COURIER.name)
+            whole = suite_on_map(suite, map_name, seed, episodes, roughness or 0.0, event or (), robot=driven_by)
         err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
     elif roughness is not None:
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
         whole = load_suite(suite)
+    whole = with_robot(whole, robot)
     whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
     picked = scenarios_chosen(whole, scenario or (), episodes, event or ())
     loaded = load_policy(policy)
@@ -152,6 +157,7 @@ def run_command(
         endpoint = checked_endpoint(director, "--director")
         outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
     options = EpisodeOptions(
+        robot=robot,
         suite_hash=whole.content_hash,
         camera=drawn_by,
         frames_every_s=frames,
@@ -209,9 +215,10 @@ def run_command(
 def list_all(
     suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
 ) -> None:
-    """List the suites and policies, or the scenarios of a suite."""
+    """List the suites, robots and policies, or the scenarios of a suite."""
     from cosim.cli.tables import print_scenarios
     from cosim.policies import POLICIES
+    from cosim.spec.robot import ROBOTS
     from scenarios.catalog import SUITES, load_suite
 
     if suite is None:
@@ -219,6 +226,11 @@ def list_all(
             whole = load_suite(name)
             out.print(
                 f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}"
+            )
+        for one in ROBOTS.values():
+            size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
+            out.print(
+                f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at {one.w_max_radps:g} rad/s"
             )
         for name, make in POLICIES.items():
             out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)

@@ -23,6 +23,7 @@ CAMERA_HELP = (
     "What draws the pictures: gl (OpenGL), bullet (slow, bare, anywhere), bullet-egl (bare, by OpenGL), or auto: gl "
     "where it works, else bullet."
 )
+ROBOT_HELP = "In place of the scenario's: which robot drives, by its name (`cosim list`)."
 RESIDENTS_HELP = "In place of the scenario's: so many people who sit on benches, look into shop windows, wait at stops."
 
 
@@ -45,6 +46,7 @@ def look(
         str | None, typer.Option(help="Where the scenario is: a suite or a suite's .json file; by default looked up.")
     ] = None,
     policy: Annotated[str, typer.Option(help="Who drives until then.")] = "route",
+    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
     residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
     groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
@@ -53,14 +55,14 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import holding, load_suite, scenarios_chosen, with_crowd
+    from scenarios.catalog import holding, load_suite, scenarios_chosen, with_crowd, with_robot
     from scenarios.viewing.look import look_at
 
     picked = view_of(view)
     pixels = size_of(size)
     check_output(output)
     found = holding(scenario) if suite is None else load_suite(suite)
-    whole = with_crowd(found, residents=residents, groups=groups, elderly=elderly, children=children)
+    whole = with_crowd(with_robot(found, robot), residents=residents, groups=groups, elderly=elderly, children=children)
     (one,) = scenarios_chosen(whole, [scenario])
     with doing("choosing the camera") as tell:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)

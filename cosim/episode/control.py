@@ -6,25 +6,17 @@ The rule is the one shipped with GNM, ViNT and NoMaD: v = dx / dt, w = atan2(dy,
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from cosim.core.errors import PolicyError
 from cosim.core.state import Command
+from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
 REAL_KINDS = "iuf"
 """The kinds of numpy that are real numbers: integers, unsigned, floating."""
 _MOST_SHOWN = 80
-
-
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """What the robot is able to do: speeds as magnitudes."""
-
-    v_mps: float = 2.5
-    w_radps: float = 0.65
 
 
 def command_from_waypoint(dx_m: float, dy_m: float, dt_s: float) -> Command:
@@ -36,14 +28,13 @@ def command_from_waypoint(dx_m: float, dy_m: float, dt_s: float) -> Command:
     return Command(dx_m / dt_s, math.atan2(dy_m, dx_m) / dt_s)
 
 
-def clipped(command: Command, limits: Limits) -> Command:
-    """`command` within the robot's limits. Policies drive forward: a negative speed becomes 0."""
-    return Command(
-        min(max(command.v_mps, 0.0), limits.v_mps), min(max(command.w_radps, -limits.w_radps), limits.w_radps)
-    )
+def clipped(command: Command, robot: Robot) -> Command:
+    """`command` within a robot's limits. Policies drive forward: a negative speed becomes 0."""
+    w_radps = min(max(command.w_radps, -robot.w_max_radps), robot.w_max_radps)
+    return Command(min(max(command.v_mps, 0.0), robot.v_max_mps), w_radps)
 
 
-def command_of(answer: object, *, waypoint_dt_s: float, limits: Limits) -> Command:
+def command_of(answer: object, *, waypoint_dt_s: float, robot: Robot) -> Command:
     """The clipped command in a policy's answer: a Command, or waypoints (N, 2) of which the first is followed.
 
     Raises PolicyError, saying what was answered, for NaN, infinities, and anything that is not real numbers of that
@@ -55,9 +46,9 @@ def command_of(answer: object, *, waypoint_dt_s: float, limits: Limits) -> Comma
         if not all(map(math.isfinite, numbers)):
             shown = ", ".join(f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True))
             raise PolicyError(f"answered Command({shown}): both must be finite numbers")
-        return clipped(Command(*numbers), limits)
+        return clipped(Command(*numbers), robot)
     dx_m, dy_m = _first_waypoint(answer)
-    return clipped(command_from_waypoint(dx_m, dy_m, waypoint_dt_s), limits)
+    return clipped(command_from_waypoint(dx_m, dy_m, waypoint_dt_s), robot)
 
 
 def _first_waypoint(answer: object) -> tuple[float, float]:

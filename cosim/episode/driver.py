@@ -18,7 +18,7 @@ from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
 from cosim.core.state import Command, RobotState, Signal, Vehicles
-from cosim.episode.control import Limits, command_of
+from cosim.episode.control import command_of
 from cosim.episode.ports import Manifest, Observation, Policy, Privileged
 
 PolicyCall = Literal["loading", "reset", "first act", "act"]
@@ -59,11 +59,10 @@ class Driver:
         manifest: Manifest | None = None,
         source_hash: str = "",
         timer: Timer | None = None,
-        limits: Limits = Limits(),  # noqa: B008  a frozen value
     ) -> None:
         self.manifest = policy.manifest if manifest is None else manifest
         self.source_hash = source_hash
-        self._policy, self._limits = policy, limits
+        self._policy = policy
         self._timer: Timer = Untimed() if timer is None else timer
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
@@ -84,7 +83,7 @@ class Driver:
         own = self._own(observation)
         with self._asked("act" if self._answered else "first act", observation.tick):
             answer = self._policy.act(own)
-            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, limits=self._limits)
+            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, robot=own.robot)
         self._answered = True
         return command
 

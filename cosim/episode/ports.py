@@ -14,6 +14,7 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.robot import Mount, Robot
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +52,9 @@ class Lens:
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """A policy's camera: size in pixels, vertical field of view in degrees.
+    """A policy's camera: size in pixels, vertical field of view in degrees, and where it sits.
 
-    mount_m: x ahead, y left, z up of the robot's base, which lies on the ground; pitch_down_deg: below the horizon.
+    mount: the name of one of the robot's mounts, which every robot has elsewhere, or a place on any robot.
 
     >>> CameraSpec(width=512, height=288, fov_deg=60.0).width
     512
@@ -62,9 +63,12 @@ class CameraSpec:
     width: int = 96
     height: int = 96
     fov_deg: float = 75.0
-    mount_m: tuple[float, float, float] = (0.30, 0.0, 0.62)
-    pitch_down_deg: float = 10.0
+    mount: str | Mount = "front"
     lens: Lens = Lens()
+
+    def on(self, robot: Robot) -> Mount:
+        """Where it sits on a robot. Raises UsageError, listing the robot's mounts, if it has none of that name."""
+        return robot.mount(self.mount) if isinstance(self.mount, str) else self.mount
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,9 +94,11 @@ class Privileged:
 class Observation:
     """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds.
 
-    tick, time_s: since the start of the episode; privileged: only for a manifest that declares it.
+    tick, time_s: since the start of the episode; robot: which one it drives, the same from reset to the end: its size,
+    its pace, its limits; privileged: only for a manifest that declares it.
 
-    >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0).privileged is None
+    >>> from cosim.spec.robot import COURIER
+    >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER).privileged is None
     True
     """
 
@@ -101,6 +107,7 @@ class Observation:
     rgb: NDArray[np.uint8] | None
     v_mps: float
     w_radps: float
+    robot: Robot
     privileged: Privileged | None = None
 
 

@@ -19,7 +19,7 @@ class Stop:
 
 
 class Straight:
-    """Drives straight ahead at walking speed."""
+    """Drives straight ahead, four fifths as fast as the robot travels: the courier at walking speed."""
 
     manifest = Manifest("straight")
 
@@ -27,4 +27,4 @@ class Straight:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:
-        return Command(1.2, 0.0)
+        return Command(observation.robot.cruise_mps * 4 / 5, 0.0)

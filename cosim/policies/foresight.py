@@ -13,12 +13,10 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from cosim.core.geometry import Floats, Polyline, Pose, wrap_angles
+from cosim.spec.robot import Robot
 
 STEP_S: Final = 0.2
 STEPS: Final = 20
-V_RAMP_MPS2: Final = 2.0
-W_RAMP_RADPS2: Final = 2.5
-_W_RADPS: Final = 0.65
 _GAIN_PER_S: Final = 2.4
 _LOOK_M: Final = 1.0
 TURN_FIRST_RAD: Final = 1.1
@@ -81,7 +79,9 @@ class Ahead(NamedTuple):
     command: Floats
 
 
-def steering(way: Way, plans: Plans, pose: Floats, s_m: Floats, after_s: float) -> tuple[Floats, Floats]:
+def steering(
+    way: Way, plans: Plans, w_max_radps: float, pose: Floats, s_m: Floats, after_s: float
+) -> tuple[Floats, Floats]:
     """(v, w), (K,) each: how robots at poses (K, 3) with arc lengths (K,) follow their plans, `after_s` from now."""
     x, y, heading = way.at(s_m)
     here = -(pose[:, 0] - x) * np.sin(heading) + (pose[:, 1] - y) * np.cos(heading)
@@ -91,15 +91,23 @@ def steering(way: Way, plans: Plans, pose: Floats, s_m: Floats, after_s: float) 
     target = way.place(s_m + _LOOK_M, here + np.clip(lane - here, -reach, reach))
     bearing = wrap_angles(np.arctan2(target[:, 1] - pose[:, 1], target[:, 0] - pose[:, 0]) - pose[:, 2])
     slowed = np.maximum(1.0 - np.abs(bearing) / TURN_FIRST_RAD, 0.05)
-    return plans.speed_mps * np.minimum(slowed * 1.35, 1.0), np.clip(_GAIN_PER_S * bearing, -_W_RADPS, _W_RADPS)
+    return plans.speed_mps * np.minimum(slowed * 1.35, 1.0), np.clip(_GAIN_PER_S * bearing, -w_max_radps, w_max_radps)
 
 
 def foresee(
-    way: Way, plans: Plans, pose: Pose, s_m: float, speeds: tuple[float, float], people: Floats, walks: Floats
+    way: Way,
+    plans: Plans,
+    robot: Robot,
+    pose: Pose,
+    s_m: float,
+    speeds: tuple[float, float],
+    people: Floats,
+    walks: Floats,
 ) -> Ahead:
-    """Drive every plan STEPS ahead. speeds: v m/s and w rad/s now; people (N, 2) m, walks (N, 2) m/s."""
+    """Drive every plan STEPS ahead with a robot. speeds: v m/s and w rad/s now; people (N, 2) m, walks (N, 2) m/s."""
     count = len(plans.lane_m)
-    robot = np.tile(np.array(pose), (count, 1))
+    v_step, w_step = STEP_S * (robot.acceleration_mps2 * 4 / 5), STEP_S * (robot.acceleration_radps2 * 5 / 6)
+    at = np.tile(np.array(pose), (count, 1))
     along = np.full(count, s_m)
     v, w = np.full(count, speeds[0]), np.full(count, speeds[1])
     others = np.tile(people, (count, 1, 1))
@@ -109,21 +117,21 @@ def foresee(
     poses, arcs, places = [], [], []
     command = np.zeros((count, 2))
     for k in range(STEPS):
-        v_goal, w_goal = steering(way, plans, robot, along, k * STEP_S)
+        v_goal, w_goal = steering(way, plans, robot.w_max_radps, at, along, k * STEP_S)
         if k == 0:
             command = np.column_stack([v_goal, w_goal])
-        v = v + np.clip(v_goal - v, -V_RAMP_MPS2 * STEP_S, V_RAMP_MPS2 * STEP_S)
-        w = w + np.clip(w_goal - w, -W_RAMP_RADPS2 * STEP_S, W_RAMP_RADPS2 * STEP_S)
-        middle = robot[:, 2] + 0.5 * STEP_S * w
-        robot = robot + STEP_S * np.column_stack([v * np.cos(middle), v * np.sin(middle), w])
+        v = v + np.clip(v_goal - v, -v_step, v_step)
+        w = w + np.clip(w_goal - w, -w_step, w_step)
+        middle = at[:, 2] + 0.5 * STEP_S * w
+        at = at + STEP_S * np.column_stack([v * np.cos(middle), v * np.sin(middle), w])
         along = along + STEP_S * v * np.cos(middle - way.at(along)[2])
         if aims.any():
-            to_robot = robot[:, None, :2] - others
+            to_robot = at[:, None, :2] - others
             far = np.hypot(to_robot[..., 0], to_robot[..., 1])
             turns = (aims & (far > COMMITS_M))[..., None]
             velocity = np.where(turns, pace[:, None] * to_robot / np.maximum(far, 1e-9)[..., None], velocity)
         others = others + STEP_S * velocity
-        poses.append(robot)
+        poses.append(at)
         arcs.append(along)
         places.append(others)
     return Ahead(np.stack(poses), np.stack(arcs), np.stack(places), command)

@@ -119,8 +119,9 @@ def _wrong_camera(camera: CameraSpec) -> str:
         return f"camera must have sides of 1 to {_MOST_PX} pixels, not {camera.width} x {camera.height}"
     if not 0.0 < camera.fov_deg < 180.0:
         return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
-    if not all(map(math.isfinite, (*camera.mount_m, camera.pitch_down_deg))):
-        return f"camera mount_m and pitch_down_deg must be finite, not {camera.mount_m}, {camera.pitch_down_deg}"
+    mount = camera.mount
+    if not isinstance(mount, str) and not all(map(math.isfinite, (*mount.at_m, mount.pitch_down_deg))):
+        return f"camera mount at_m and pitch_down_deg must be finite, not {mount.at_m}, {mount.pitch_down_deg}"
     return ""
 
 

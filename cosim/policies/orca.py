@@ -14,6 +14,7 @@ Red signals, cars near a crossing and a stopping hand limit the speed so that it
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,13 +25,15 @@ from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import PERSON_RADIUS_M, Command, People
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
+from cosim.policies.body import BodyDisks
 from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, who_stands
-from cosim.policies.route import BODY_RADIUS_M, CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
+from cosim.policies.route import CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
+from cosim.spec.robot import Robot
 
-_CRUISE_MPS: Final = 1.4
 LANES_M: Final = np.arange(-8, 9) * 0.25
-_SPEEDS_MPS: Final = (1.4, 0.9, 0.45)
+_SPEED_THIRTIETHS: Final = (28, 18, 9)
+"""Speeds of plans, in thirtieths of the robot's pace: who foresees so much drives a little slower than that."""
 MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
 """Delay in seconds and sideways metres per metre of a change of lanes."""
 OUT_OF_A_NOOK: Final = (0.0, 3.0)
@@ -38,10 +41,6 @@ OUT_OF_A_NOOK: Final = (0.0, 3.0)
 
 _HORIZON_S: Final = 3.0
 """ORCA's tau."""
-_AROUND_M: Final = 0.45
-"""Radius of the disk round the whole robot."""
-_NOSE_M: Final = 0.18
-"""From the base centre to the middles of the two disks of the body."""
 
 _CLEARANCE_M: Final = 0.3
 _TIGHT_M: Final = 0.12
@@ -105,7 +104,8 @@ class Orca:
             raise ValueError("the orca policy needs privileged observations")
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
-        limit_mps = min(crossing_limit(known), stop_limit(known), _CRUISE_MPS)
+        robot = observation.robot
+        limit_mps = min(crossing_limit(known, robot), stop_limit(known), speeds_of(robot)[0])
         x_m, y_m, _ = known.robot.pose
         self._stuck_s += dt_s
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
@@ -114,11 +114,15 @@ class Orca:
         way, room = self._way_of(known), self._room_of(known)
         people = nearby(known)
         ends = lines(people)
-        aim_m = lane_past(known, way, room, ends, self._lane_m)
-        wished = bent(known, way, people, aim_m, limit_mps)
-        plans = all_plans(lanes_inside(known, way, room), limit_mps)
-        ahead, gaps = foreseen(known, way, plans, people, ends)
-        score = self._scores(known, plans, ahead, gaps, outside(way, room, ahead), wished, aim_m)
+        disks = BodyDisks.of(robot)
+        aim_m = lane_past(known, disks, way, room, ends, self._lane_m)
+        wished = bent(known, robot, way, people, aim_m, limit_mps)
+        plans = all_plans(lanes_inside(known, way, room), [min(speed, limit_mps) for speed in speeds_of(robot)])
+        ahead, gaps = foreseen(known, robot, way, plans, people, ends)
+        weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
+        out = outside(way, room, ahead, robot.length_m * 2 / 7)
+        out = weights.edge * out + _NEARNESS_COST * car_nearness(known, disks, ahead)
+        score = self._scores(known, plans, ahead, gaps, wished, aim_m, weights) - out
         best = int(np.argmax(score))
         if plans.speed_mps[best] > 0.0:
             self._lane_m = float(plans.lane_m[best]) if plans.delay_s[best] == 0.0 else self._lane_m
@@ -126,10 +130,16 @@ class Orca:
         return Command(float(v_mps), float(w_radps))
 
     def _scores(
-        self, known: Privileged, plans: Plans, ahead: Ahead, gaps: Floats, out: Floats, wished: Floats, aim_m: float
+        self,
+        known: Privileged,
+        plans: Plans,
+        ahead: Ahead,
+        gaps: Floats,
+        wished: Floats,
+        aim_m: float,
+        weights: Weights,
     ) -> Floats:
-        """How good each plan is, (K,) in m/s of speed."""
-        weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
+        """How good each plan is among people, (K,) in m/s of speed."""
         near = max(round(NEAR_S / STEP_S), 1)
         velocity = (ahead.pose[near - 1, :, :2] - known.robot.pose.xy) / (near * STEP_S)
         off_wish = np.hypot(*(velocity - wished).T)
@@ -138,7 +148,6 @@ class Orca:
         nearness = _NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
         touch = TOUCH_COST * np.maximum(0.05 - gaps, 0.0)
         scores: Floats = weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
-        scores -= weights.edge * out + _NEARNESS_COST * car_nearness(known, ahead)
         return scores
 
     def _way_of(self, known: Privileged) -> Way:
@@ -195,7 +204,9 @@ def stop_limit(known: Privileged) -> float:
     return limit_mps
 
 
-def lane_past(known: Privileged, way: Way, room: shapely.Geometry, ends: Floats, current_m: float) -> float:
+def lane_past(
+    known: Privileged, disks: BodyDisks, way: Way, room: shapely.Geometry, ends: Floats, current_m: float
+) -> float:
     """The lane beside the route, m to the left, on which the robot best gets past what stands ahead."""
     here = way.lateral(known.robot.pose, known.route_s_m)
     shift = LANE_SLOPE * LANE_AHEAD_M
@@ -203,7 +214,7 @@ def lane_past(known: Privileged, way: Way, room: shapely.Geometry, ends: Floats,
     points = way.place(np.broadcast_to(known.route_s_m + LANE_AHEAD_M, lane.shape), lane)
     gaps = np.full(len(LANES_M), np.inf)
     if len(ends):
-        gaps = (distances(points, ends) - PERSON_RADIUS_M - BODY_RADIUS_M).min(axis=(1, 2))
+        gaps = (distances(points, ends) - PERSON_RADIUS_M - disks.radius_m).min(axis=(1, 2))
     out = ~shapely.contains_xy(room, points[..., 0], points[..., 1])
     out &= known.route_s_m + LANE_AHEAD_M < way.length_m
     cost = LANE_COST * np.abs(LANES_M) + 0.5 * _CHANGE_COST * np.abs(LANES_M - current_m)
@@ -211,21 +222,21 @@ def lane_past(known: Privileged, way: Way, room: shapely.Geometry, ends: Floats,
     return float(LANES_M[int(np.argmin(cost))])
 
 
-def bent(known: Privileged, way: Way, people: People, aim_m: float, limit_mps: float) -> Floats:
+def bent(known: Privileged, robot: Robot, way: Way, people: People, aim_m: float, limit_mps: float) -> Floats:
     """The velocity (2,) towards the lane, bent so that nobody who walks is met within HORIZON_S."""
-    robot = known.robot
-    here = way.lateral(robot.pose, known.route_s_m)
+    state = known.robot
+    here = way.lateral(state.pose, known.route_s_m)
     lane_m = here + max(-1.0, min(1.0, aim_m - here))
-    ahead = way.place(np.array(known.route_s_m + 2.0), np.array(lane_m)) - robot.pose.xy
+    ahead = way.place(np.array(known.route_s_m + 2.0), np.array(lane_m)) - state.pose.xy
     wish = limit_mps * ahead / max(float(np.hypot(*ahead)), 1e-9)
-    mine = robot.v_mps * np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
-    radius_m = _AROUND_M + PERSON_RADIUS_M + _TIGHT_M
+    mine = state.v_mps * np.array([math.cos(state.pose.heading_rad), math.sin(state.pose.heading_rad)])
+    radius_m = BodyDisks.of(robot).around_m + PERSON_RADIUS_M + _TIGHT_M
     planes = [
-        half_plane(xy - robot.pose.xy, mine, velocity, radius_m, _HORIZON_S, 1.0, 0.5)
+        half_plane(xy - state.pose.xy, mine, velocity, radius_m, _HORIZON_S, 1.0, 0.5)
         for xy, velocity, still in zip(people.xy, walks(people), who_stands(people), strict=True)
         if not still
     ]
-    return best_velocity(planes, wish, _CRUISE_MPS)
+    return best_velocity(planes, wish, speeds_of(robot)[0])
 
 
 def lanes_inside(known: Privileged, way: Way, room: shapely.Geometry) -> Floats:
@@ -237,41 +248,47 @@ def lanes_inside(known: Privileged, way: Way, room: shapely.Geometry) -> Floats:
     return lanes
 
 
-def all_plans(lanes: Floats, limit_mps: float) -> Plans:
+def speeds_of(robot: Robot) -> list[float]:
+    """The speeds of plans, m/s, the fastest first."""
+    return [robot.cruise_mps * part / 30 for part in _SPEED_THIRTIETHS]
+
+
+def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
     """Every lane at every speed in every manner, and waiting."""
-    speeds = [min(speed, limit_mps) for speed in _SPEEDS_MPS]
     rows = [(lane, speed, slope, delay) for lane in lanes for speed in speeds for delay, slope in MANOEUVRES]
     rows += [(lane, speeds[-1], OUT_OF_A_NOOK[1], OUT_OF_A_NOOK[0]) for lane in lanes]
     rows.append((0.0, 0.0, MANOEUVRES[0][1], 0.0))
     return Plans(*np.array(rows).T)
 
 
-def foreseen(known: Privileged, way: Way, plans: Plans, people: People, ends: Floats) -> tuple[Ahead, Floats]:
+def foreseen(
+    known: Privileged, robot: Robot, way: Way, plans: Plans, people: People, ends: Floats
+) -> tuple[Ahead, Floats]:
     """What becomes of the plans, and the smallest gap (K,) m of each between the body and anybody."""
     moving = ~who_stands(people)
     xy, velocity = people.xy[moving], followed(known, people)[moving]
-    robot = known.robot
-    ahead = foresee(way, plans, robot.pose, known.route_s_m, (robot.v_mps, robot.w_radps), xy, velocity)
+    state, disks = known.robot, BodyDisks.of(robot)
+    ahead = foresee(way, plans, robot, state.pose, known.route_s_m, (state.v_mps, state.w_radps), xy, velocity)
     gaps = np.full(ahead.s_m.shape, np.inf)
-    for body in bodies(ahead):
+    for body in bodies(ahead, disks):
         if len(xy):
             away = ahead.people - body[:, :, None]
             apart = np.sqrt(np.einsum("...i,...i", away, away)) - PERSON_RADIUS_M
-            gaps = np.minimum(gaps, apart.min(axis=-1) - BODY_RADIUS_M)
+            gaps = np.minimum(gaps, apart.min(axis=-1) - disks.radius_m)
         if len(ends):
-            gaps = np.minimum(gaps, (distances(body, ends) - PERSON_RADIUS_M - BODY_RADIUS_M).min(axis=-1))
+            gaps = np.minimum(gaps, (distances(body, ends) - PERSON_RADIUS_M - disks.radius_m).min(axis=-1))
     later = LATER_M_PER_S * STEP_S * np.arange(1, STEPS + 1)[:, None]
     return ahead, (gaps + later).min(axis=0)
 
 
-def bodies(ahead: Ahead) -> tuple[Floats, Floats]:
+def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[Floats, Floats]:
     """(STEPS, K, 2) m each: the middles of the two disks of the body."""
     heading = ahead.pose[..., 2]
-    nose = _NOSE_M * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    nose = disks.nose_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
     return ahead.pose[..., :2] + nose, ahead.pose[..., :2] - nose
 
 
-def car_nearness(known: Privileged, ahead: Ahead) -> Floats:
+def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
     """(K,) m: how much nearer than the clearance each plan comes to vehicles that brake for it, at most CAR_DEEP_M.
 
     Who enters a crossing only when every car near can still stop (`crossing_limit`) may count on their stopping; what
@@ -286,18 +303,19 @@ def car_nearness(known: Privileged, ahead: Ahead) -> Floats:
     driven_m = speed * braked_s - 0.5 * CAR_BRAKE_MPS2 * braked_s**2
     cars = xy + driven_m[..., None] * (velocity / speed[:, None])
     gaps = np.full(ahead.s_m.shape, np.inf)
-    for body in bodies(ahead):
+    for body in bodies(ahead, disks):
         away = cars[:, None] - body[:, :, None]
         apart = np.sqrt(np.einsum("...i,...i", away, away)) - radii
-        gaps = np.minimum(gaps, apart.min(axis=-1) - BODY_RADIUS_M)
+        gaps = np.minimum(gaps, apart.min(axis=-1) - disks.radius_m)
     nearness: Floats = np.clip(_CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
     return nearness
 
 
-def outside(way: Way, room: shapely.Geometry, ahead: Ahead) -> Floats:
-    """(K,) the share of each plan that lies outside the walkable area, what is near weighing most."""
+def outside(way: Way, room: shapely.Geometry, ahead: Ahead, nose_m: float) -> Floats:
+    """(K,) the share of each plan whose base centre, or a point `nose_m` before it, lies outside the walkable area,
+    what is near weighing most."""
     pose = ahead.pose[::2]
-    nose = pose[..., :2] + 0.2 * np.stack([np.cos(pose[..., 2]), np.sin(pose[..., 2])], axis=-1)
+    nose = pose[..., :2] + nose_m * np.stack([np.cos(pose[..., 2]), np.sin(pose[..., 2])], axis=-1)
     out = ~shapely.contains_xy(room, pose[..., 0], pose[..., 1]) | ~shapely.contains_xy(
         room, nose[..., 0], nose[..., 1]
     )

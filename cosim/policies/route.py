@@ -14,11 +14,13 @@ import shapely
 
 from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command
+from cosim.episode.control import clipped
 from cosim.episode.ports import Manifest, Observation, Privileged
+from cosim.policies.body import BodyDisks
+from cosim.spec.robot import Robot
 
-_CRUISE_MPS = 1.5
-_SPEEDS_MPS = np.array([1.5, 1.0, 0.5, 0.0])
-"""Speeds that are compared, the last one waiting."""
+_SPEED_THIRDS = np.array([3.0, 2.0, 1.0, 0.0])
+"""Speeds that are compared, in thirds of the robot's pace, the last one waiting."""
 
 OFFSETS_M = np.array([0.0, 0.35, -0.35, 0.7, -0.7, 1.05, -1.05, 1.4, -1.4])
 TIMES_S = np.linspace(0.25, 3.5, 14)
@@ -29,17 +31,13 @@ SHIFT_AFTER_M = 0.3
 _LOOK_AHEAD_M = 1.2
 GAIN_P_PER_S = 2.4
 GAIN_D = 0.12
-W_RADPS = 0.65
 BRAKE_MPS2 = 1.2
 CAR_BRAKE_MPS2 = 3.0
-STOP_SHORT_M = 0.9
-"""Distance of the base centre from the edge of a crossing that it waits at."""
+STOP_SHORT_M = 0.55
+"""Distance of the robot's front from the edge of a crossing that it waits at."""
 
 HELD_MPS = 0.1
 """A robot that is slower has stopped at red, and does not start because it has crept nearer."""
-HALF_LENGTH_M = 0.35
-BODY_RADIUS_M = 0.33
-"""The body as two disks, fore and aft."""
 CAR_RADIUS_M = 1.1
 """A vehicle as three disks along its length."""
 
@@ -75,17 +73,18 @@ class Route:
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
 
-        limit_mps = min(crossing_limit(known), _CRUISE_MPS)
+        robot = observation.robot
+        limit_mps = min(crossing_limit(known, robot), robot.cruise_mps)
         held = limit_mps < 0.1
         self._stopped_s = 0.0 if observation.v_mps > 0.1 or held else self._stopped_s + dt_s
-        self._offset_m, free_mps = best_lane(known, self._offset_m, patient=self._stopped_s < _PATIENCE_S)
+        self._offset_m, free_mps = best_lane(known, robot, self._offset_m, patient=self._stopped_s < _PATIENCE_S)
 
         bearing_rad = bearing_to(known, self._offset_m)
         rate_radps = (bearing_rad - self._bearing_rad) / dt_s
         self._bearing_rad = bearing_rad
         w_radps = GAIN_P_PER_S * bearing_rad + GAIN_D * max(-2.0, min(2.0, rate_radps))
-        turning_mps = 0.0 if abs(bearing_rad) > 1.2 else _CRUISE_MPS * (1.0 - abs(bearing_rad) / 1.2) + 0.05
-        return Command(min(limit_mps, free_mps, turning_mps), max(-W_RADPS, min(W_RADPS, w_radps)))
+        turning_mps = 0.0 if abs(bearing_rad) > 1.2 else robot.cruise_mps * (1.0 - abs(bearing_rad) / 1.2) + 0.05
+        return clipped(Command(min(limit_mps, free_mps, turning_mps), w_radps), robot)
 
 
 def bearing_to(known: Privileged, offset_m: float) -> float:
@@ -100,22 +99,23 @@ def bearing_to(known: Privileged, offset_m: float) -> float:
     return wrap_angle(math.atan2(target_y - y, target_x - x) - heading)
 
 
-def crossing_limit(known: Privileged) -> float:
+def crossing_limit(known: Privileged, robot: Robot) -> float:
     """Speed in m/s at which the robot can still stop before the next crossing that it must not enter now."""
+    half_m, crosses_mps = robot.length_m / 2, robot.cruise_mps * 13 / 15
     for crossing_id, enter_s_m, leave_s_m in known.crossings:
         before_m = enter_s_m - known.route_s_m
         if not 0.0 < before_m < 8.0:
             continue
-        needs_s = (before_m + leave_s_m - enter_s_m + HALF_LENGTH_M) / 1.3 + 0.5
+        needs_s = (before_m + leave_s_m - enter_s_m + half_m) / crosses_mps + 0.5
         signal = known.signals.get(crossing_id)
         if signal is not None:
             may_enter = signal.walk and (signal.changes_in_s is None or signal.changes_in_s > needs_s)
         else:
             may_enter = not car_coming(known, enter_s_m, leave_s_m)
-        waits = before_m > HALF_LENGTH_M or (signal is not None and known.robot.v_mps < HELD_MPS)
+        waits = before_m > half_m or (signal is not None and known.robot.v_mps < HELD_MPS)
         if not may_enter and waits:
-            room_m = before_m - STOP_SHORT_M
-            return math.sqrt(2.0 * BRAKE_MPS2 * room_m) if room_m > 0.05 else 0.0
+            room_m = before_m - (half_m + STOP_SHORT_M)
+            return math.sqrt(2.0 * min(BRAKE_MPS2, robot.acceleration_mps2) * room_m) if room_m > 0.05 else 0.0
     return math.inf
 
 
@@ -134,7 +134,7 @@ def car_coming(known: Privileged, enter_s_m: float, leave_s_m: float) -> bool:
     return bool((near & cannot_stop & (vehicles.speed > 0.5)).any())
 
 
-def best_lane(known: Privileged, current_m: float, *, patient: bool) -> tuple[float, float]:
+def best_lane(known: Privileged, robot: Robot, current_m: float, *, patient: bool) -> tuple[float, float]:
     """(offset, speed): the lane beside the route worth taking and the speed to drive on it, 0 to wait.
 
     The fastest plan wins, less what it costs to leave the route, to change the lane, and to come nearer to anyone than
@@ -143,16 +143,17 @@ def best_lane(known: Privileged, current_m: float, *, patient: bool) -> tuple[fl
     """
     centres, velocities, radii = obstacles(known)
     if not len(centres):
-        return 0.0, _CRUISE_MPS
-    paths = plans(known.route, known.route_s_m, lateral_of(known))
-    gaps = smallest_gaps(paths, known.robot.pose.heading_rad, centres, velocities, radii)
+        return 0.0, robot.cruise_mps
+    speeds_mps = robot.cruise_mps * _SPEED_THIRDS / 3.0
+    paths = plans(known.route, known.route_s_m, lateral_of(known), speeds_mps)
+    gaps = smallest_gaps(paths, BodyDisks.of(robot), known.robot.pose.heading_rad, centres, velocities, radii)
     inside = np.asarray(shapely.contains_xy(known.free, paths[:, 0, :, 0], paths[:, 0, :, 1])).all(axis=1)
     gaps[~inside & (OFFSETS_M != 0.0), :-1] = -np.inf
     clearance_m, effort_cost = (_CLEARANCE_M, 1.0) if patient else (_TIGHT_M, 0.1)
     effort = OFFSET_COST * np.abs(OFFSETS_M) + _CHANGE_COST * np.abs(OFFSETS_M - current_m)
-    score = _SPEEDS_MPS - effort_cost * effort[:, None] - _NEARNESS_COST * np.maximum(clearance_m - gaps, 0.0)
+    score = speeds_mps - effort_cost * effort[:, None] - _NEARNESS_COST * np.maximum(clearance_m - gaps, 0.0)
     lane, speed = np.unravel_index(int(np.argmax(score)), score.shape)
-    return float(OFFSETS_M[lane]), float(_SPEEDS_MPS[speed])
+    return float(OFFSETS_M[lane]), float(speeds_mps[speed])
 
 
 def lateral_of(known: Privileged) -> float:
@@ -189,9 +190,9 @@ def car_disks(known: Privileged) -> tuple[Floats, Floats, Floats]:
     return centres, velocities, np.full(len(centres), CAR_RADIUS_M)
 
 
-def plans(route: Polyline, s_m: float, lateral_m: float) -> Floats:
+def plans(route: Polyline, s_m: float, lateral_m: float, speeds_mps: Floats) -> Floats:
     """Where the robot would be on each lane, at each speed, at each of TIMES_S: (lanes, speeds, times, 2) metres."""
-    driven = _SPEEDS_MPS[:, None] * TIMES_S
+    driven = speeds_mps[:, None] * TIMES_S
     along = np.minimum(s_m + driven, route.length_m)
     x, y = np.interp(along, route.s_m, route.points[:, 0]), np.interp(along, route.s_m, route.points[:, 1])
     ahead = np.minimum(along + 0.2, route.length_m)
@@ -204,12 +205,14 @@ def plans(route: Polyline, s_m: float, lateral_m: float) -> Floats:
     return np.stack([x - lateral * dy / norm, y + lateral * dx / norm], axis=-1)
 
 
-def smallest_gaps(paths: Floats, heading_rad: float, centres: Floats, velocities: Floats, radii: Floats) -> Floats:
+def smallest_gaps(
+    paths: Floats, disks: BodyDisks, heading_rad: float, centres: Floats, velocities: Floats, radii: Floats
+) -> Floats:
     """The smallest gap of each plan between the body and any predicted disk, (lanes, speeds) metres."""
     people = centres + velocities * TIMES_S[:, None, None]
-    nose = 0.18 * np.array([math.cos(heading_rad), math.sin(heading_rad)])
+    nose = disks.nose_m * np.array([math.cos(heading_rad), math.sin(heading_rad)])
     gaps = np.full(paths.shape[:2], np.inf)
     for body in (paths + nose, paths - nose):
         away = body[:, :, :, None, :] - people
-        gaps = np.minimum(gaps, (np.hypot(away[..., 0], away[..., 1]) - radii - BODY_RADIUS_M).min(axis=(2, 3)))
+        gaps = np.minimum(gaps, (np.hypot(away[..., 0], away[..., 1]) - radii - disks.radius_m).min(axis=(2, 3)))
     return gaps

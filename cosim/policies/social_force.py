@@ -21,11 +21,13 @@ import shapely
 
 from cosim.core.geometry import Floats, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M, Command, People
+from cosim.episode.control import clipped
 from cosim.episode.ports import Manifest, Observation, Privileged
-from cosim.policies.route import W_RADPS, crossing_limit
+from cosim.policies.route import crossing_limit
+from cosim.spec.robot import Robot
 
 DESIRED_MPS: Final = 1.34
-"""The paper's mean desired speed."""
+"""The paper's mean desired speed; a slower robot's pace is lower."""
 RELAXATION_S: Final = 0.5
 """tau: how fast the desired velocity is taken up again."""
 PEOPLE_MPS2: Final = 4.30
@@ -35,8 +37,6 @@ STEP_AHEAD_S: Final = 0.5
 """Delta t: the relative motion over this time stretches the ellipse."""
 BEHIND: Final = 0.06
 """lambda: what is right behind counts for so much."""
-BODIES_M: Final = 0.36 + PERSON_RADIUS_M
-"""Between the middles of the robot and of a person that it touches with its front."""
 LEANS_RAD: Final = math.radians(15.0)
 """A push is turned by so much, so that the robot passes on the right of whoever is straight ahead."""
 EDGES_M2PS2: Final = 10.0
@@ -63,28 +63,37 @@ class SocialForce:
         known = observation.privileged
         if known is None:
             raise ValueError("the social_force policy needs privileged observations")
-        robot = known.robot
-        heading = robot.pose.heading_rad
-        velocity = robot.v_mps * np.array([math.cos(heading), math.sin(heading)])
-        wanted = velocity + ACTS_FOR_S * force(known, velocity)
-        speed = min(math.hypot(*wanted), 1.3 * DESIRED_MPS, crossing_limit(known))
+        robot, state = observation.robot, known.robot
+        heading = state.pose.heading_rad
+        velocity = state.v_mps * np.array([math.cos(heading), math.sin(heading)])
+        wanted = velocity + ACTS_FOR_S * force(known, robot, velocity)
+        speed = min(math.hypot(*wanted), 1.3 * desired_mps(robot), crossing_limit(known, robot))
         off_rad = wrap_angle(math.atan2(wanted[1], wanted[0]) - heading)
-        w_radps = max(-W_RADPS, min(W_RADPS, _GAIN_PER_S * off_rad))
-        return Command(speed * max(math.cos(off_rad), 0.0), w_radps)
+        return clipped(Command(speed * max(math.cos(off_rad), 0.0), _GAIN_PER_S * off_rad), robot)
 
 
-def force(known: Privileged, velocity: Floats) -> Floats:
+def desired_mps(robot: Robot) -> float:
+    """The speed that its goal pulls a robot to."""
+    return min(DESIRED_MPS, robot.cruise_mps)
+
+
+def force(known: Privileged, robot: Robot, velocity: Floats) -> Floats:
     """The acceleration (2,) m/s2 of a robot that drives at `velocity` (2,)."""
     here = known.robot.pose.xy
     ahead = known.route.at(min(known.route_s_m + _LOOK_M, known.route.length_m)).xy - here
     direction = ahead / max(math.hypot(*ahead), 1e-9)
-    pull = (DESIRED_MPS * direction - velocity) / RELAXATION_S
-    pushes = seen(from_people(known.people, here, velocity), direction)
-    total: Floats = pull + pushes.sum(axis=0) + from_edge(known, here)
+    pull = (desired_mps(robot) * direction - velocity) / RELAXATION_S
+    pushes = seen(from_people(known.people, robot, here, velocity), direction)
+    total: Floats = pull + pushes.sum(axis=0) + from_edge(known, robot, here)
     return total
 
 
-def from_people(people: People, here: Floats, velocity: Floats) -> Floats:
+def bodies_m(robot: Robot) -> float:
+    """Between the middles of a robot and of a person that it touches with its front, a centimetre apart."""
+    return robot.length_m / 2 + 0.01 + PERSON_RADIUS_M
+
+
+def from_people(people: People, robot: Robot, here: Floats, velocity: Floats) -> Floats:
     """(N, 2) m/s2: the push of each person on a robot at `here` (2,) that drives at `velocity` (2,).
 
     d: from the person to the robot, between their outlines; y: how the person moves relative to the robot in Delta t;
@@ -93,7 +102,7 @@ def from_people(people: People, here: Floats, velocity: Floats) -> Floats:
     """
     away = here - people.xy
     r = np.maximum(np.hypot(away[:, 0], away[:, 1]), 1e-9)
-    away = away * (np.maximum(r - BODIES_M, TOUCHING_M) / r)[:, None]
+    away = away * (np.maximum(r - bodies_m(robot), TOUCHING_M) / r)[:, None]
     going = people.speed[:, None] * np.column_stack([np.cos(people.heading), np.sin(people.heading)])
     step = STEP_AHEAD_S * (going - velocity)
     from_step = away - step
@@ -116,7 +125,7 @@ def seen(pushes: Floats, direction: Floats) -> Floats:
     return weighed
 
 
-def from_edge(known: Privileged, here: Floats) -> Floats:
+def from_edge(known: Privileged, robot: Robot, here: Floats) -> Floats:
     """(2,) m/s2: the push of the nearest edge of the free area; back inside from beyond it."""
     point = shapely.Point(here)
     edge = known.free.boundary
@@ -125,5 +134,5 @@ def from_edge(known: Privileged, here: Floats) -> Floats:
     distance_m = max(math.hypot(*away), 1e-6)
     inward = away / distance_m if shapely.contains_xy(known.free, *here) else -away / distance_m
     inside_m = distance_m if shapely.contains_xy(known.free, *here) else 0.0
-    push: Floats = EDGES_M2PS2 / EDGES_M * math.exp(-(inside_m + 0.25) / EDGES_M) * inward
+    push: Floats = EDGES_M2PS2 / EDGES_M * math.exp(-(inside_m + robot.width_m / 2.2) / EDGES_M) * inward
     return push

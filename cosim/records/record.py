@@ -67,6 +67,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     suite: str
     suite_hash: str
     seed: int
+    robot: str
     policy: str
     policy_version: str
     policy_source: str = ""
@@ -121,6 +122,7 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source
         suite=scenario.suite,
         suite_hash=suite_hash,
         seed=scenario.seed,
+        robot=scenario.robot,
         policy=manifest.name,
         policy_version=manifest.version,
         policy_source=policy_source,

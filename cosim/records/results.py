@@ -14,8 +14,8 @@ from cosim.judge.metrics import COUNTERFACTUAL, METRICS
 from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
-    "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "policy",
-    "policy_version", "goal_protocol", "renderer", "ticks", "state_hash",
+    "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "robot",
+    "policy", "policy_version", "goal_protocol", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95

@@ -22,9 +22,10 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode is run. Options change what is seen and kept, never what happens in the street.
+    """How an episode is run. But for the robot, options change what is seen and kept, never what happens in the street.
 
-    suite_hash, policy_source: of the suite that the scenario is of and of the file of the policy, for the record.
+    robot: which drives (`cosim.spec.robot`), in place of the scenario's own. suite_hash, policy_source: of the suite
+    that the scenario is of and of the file of the policy, for the record.
     camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
     is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
     compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
@@ -34,6 +35,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     'bullet'
     """
 
+    robot: str = ""
     suite_hash: str = ""
     policy_source: str = ""
     camera: CameraChoice = "auto"

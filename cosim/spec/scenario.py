@@ -22,6 +22,7 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
+from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.spec_file import in_lines, read_spec_file
 
 _SCHEMA = 1
@@ -218,7 +219,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
     events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
     crowd: CrowdSpec = CrowdSpec()
-    robot: Annotated[str, _NAME] = "courier"
+    robot: Annotated[str, _NAME] = COURIER.name
     goal_radius_m: Annotated[float, Within(0.1, 20)] = 1.0
     time_limit_s: Annotated[float, Within(0.1, 100_000)] = 300.0
     ends_on_failure: bool = False
@@ -259,6 +260,10 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     @property
     def start_pose(self) -> Pose:
         return Pose(*self.start)
+
+    def driven_by(self, robot: str) -> Scenario:
+        """The same with another robot; itself where `robot` is "". Raises UsageError with the valid names."""
+        return msgspec.structs.replace(self, robot=robot_called(robot).name) if robot else self
 
     @cached_property
     def route_line(self) -> Polyline:

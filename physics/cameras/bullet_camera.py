@@ -43,7 +43,7 @@ class BulletCamera(WorldCamera):
     def __enter__(self) -> Self:
         if self._canvas is None:
             self._canvas = BulletCanvas(self._egl)
-            self._scene = BulletScene(self._canvas, self._world.surface, self._world.barriers, self._world.model)
+            self._scene = BulletScene(self._canvas, self._world.surface, self._world.barriers, self._world.robot)
         return self
 
     def close(self) -> None:
@@ -60,7 +60,7 @@ class BulletCamera(WorldCamera):
             raise EngineError("the camera is not running: use BulletCamera in a 'with' block")
         self._scene.arrange(taken.view, street)
         if robot is not None and body:
-            _, roll, pitch = self._world.surface.lean(robot.pose, self._world.model)
+            _, roll, pitch = self._world.surface.lean(robot.pose, self._world.robot.drive.span_m)
             self._scene.show_robot(robot.pose, robot.z_m, roll, pitch)
         rgb, labels, depth = self._canvas.draw(
             taken.eye_m, taken.target_m, taken.size, taken.fov_deg, NEAR_PLANE_M, FAR_PLANE_M

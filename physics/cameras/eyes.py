@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from abc import ABC, abstractmethod
 from types import TracebackType
 
@@ -22,7 +23,8 @@ class WorldCamera(ABC):
 
     def __init__(self, world: BulletWorld, spec: CameraSpec, depth: bool) -> None:
         check_size(spec.width, spec.height, spec.fov_deg)
-        self.spec, self._pinhole = spec, drawn(spec)
+        self.spec = spec = dataclasses.replace(spec, mount=spec.on(world.robot))
+        self._pinhole = drawn(spec)
         self._world, self._depth = world, depth
 
     def __exit__(
@@ -60,4 +62,4 @@ class WorldCamera(ABC):
         return through(self.spec, frame, robot, self._world.surface.seed, street.tick)
 
     def _mounted(self, robot: RobotState) -> Shot:
-        return robot_shot(self._world.surface, self._world.model, self._pinhole, robot)
+        return robot_shot(self._world.surface, self._world.robot, self._pinhole, robot)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cosim.core.errors import SpecError
 from cosim.core.state import Frame, RobotState
 from cosim.episode.ports import CameraSpec, Lens
+from cosim.spec.robot import Mount
 from physics.textures.layers import LINEAR, encoded
 
 GREY: Final = 0.18
@@ -205,11 +206,12 @@ def _flows(spec: CameraSpec) -> tuple[Map, Map]:
     H. C. Longuet-Higgins and K. Prazdny, Proc. R. Soc. B 208 (1980), over a ground plane and walls at _FAR_M.
     """
     x, y = (m.astype(float) for m in _rays(spec))
-    down = math.radians(spec.pitch_down_deg)
-    near = np.maximum((y * math.cos(down) + math.sin(down)) / max(spec.mount_m[2], 0.05), 1.0 / _FAR_M)
+    assert isinstance(spec.mount, Mount), "a camera's mount is known once it sits on its robot: CameraSpec.on"
+    down, (x_m, y_m, z_m) = math.radians(spec.mount.pitch_down_deg), spec.mount.at_m
+    near = np.maximum((y * math.cos(down) + math.sin(down)) / max(z_m, 0.05), 1.0 / _FAR_M)
     ahead = np.array([0.0, -math.sin(down), math.cos(down)])
     up = np.array([0.0, -math.cos(down), -math.sin(down)])
-    swing = -spec.mount_m[1] * ahead + np.array([-spec.mount_m[0], 0.0, 0.0])
+    swing = -y_m * ahead + np.array([-x_m, 0.0, 0.0])
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     flows = []
     for speed, turn in ((ahead, np.zeros(3)), (swing, up)):

@@ -11,13 +11,14 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import People, Street, Vehicles
+from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
 from physics.cameras.canvas import BulletCanvas, Rigs
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
 from physics.people.families import FAMILIES
 from physics.people.looks import family_of
 from physics.people.parts import part_colours, part_meshes, placed_parts
-from physics.robots import RobotModel
+from physics.robots import urdf_of
 from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
@@ -44,7 +45,7 @@ class BulletScene:
     built: number of tiles made since the start.
     """
 
-    def __init__(self, canvas: BulletCanvas, surface: Surface, barriers: Sequence[Barrier], model: RobotModel) -> None:
+    def __init__(self, canvas: BulletCanvas, surface: Surface, barriers: Sequence[Barrier], model: Robot) -> None:
         self._canvas = canvas
         self._surface = surface
         self._model = model
@@ -57,7 +58,7 @@ class BulletScene:
         self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
-        self._robot = canvas.load(model.urdf, "robot")
+        self._robot = canvas.load(urdf_of(model), "robot")
         for barrier in barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)

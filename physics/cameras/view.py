@@ -14,7 +14,7 @@ from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.core.state import RobotState
 from cosim.episode.ports import CameraSpec
-from physics.robots import RobotModel
+from cosim.spec.robot import Robot
 from physics.world.surface import Surface
 
 VISIBLE_M: Final = 50.0
@@ -110,11 +110,11 @@ def check_size(width: int, height: int, fov_deg: float) -> None:
         raise UsageError(f"a field of view of {fov_deg:g} degrees: it must be {_FOV_DEG[0]:g} to {_FOV_DEG[1]:g}")
 
 
-def robot_shot(surface: Surface, model: RobotModel, spec: CameraSpec, robot: RobotState) -> Shot:
+def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotState) -> Shot:
     """What a robot's camera looks at from its mount; it leans with the ground."""
-    turn = attitude(surface, model, robot)
-    eye = np.array([robot.pose.x_m, robot.pose.y_m, robot.z_m]) + turn @ np.array(spec.mount_m)
-    down = math.radians(spec.pitch_down_deg)
+    turn, mount = _attitude(surface, model, robot), spec.on(model)
+    eye = np.array([robot.pose.x_m, robot.pose.y_m, robot.z_m]) + turn @ np.array(mount.at_m)
+    down = math.radians(mount.pitch_down_deg)
     ahead = turn @ np.array([math.cos(down), 0.0, -math.sin(down)])
     return Shot(eye, eye + ahead, (spec.width, spec.height), spec.fov_deg)
 
@@ -124,9 +124,9 @@ def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: 
     return Shot(np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float), size, fov_deg)
 
 
-def attitude(surface: Surface, model: RobotModel, robot: RobotState) -> Floats:
+def _attitude(surface: Surface, model: Robot, robot: RobotState) -> Floats:
     """(3, 3) rotation from the base frame to the world: heading, and the slope of the surface."""
-    _, roll, pitch = surface.lean(robot.pose, model)
+    _, roll, pitch = surface.lean(robot.pose, model.drive.span_m)
     cz, sz = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     cy, sy, cx, sx = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
     yaw = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])

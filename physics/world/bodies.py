@@ -9,8 +9,9 @@ from typing import Any, Final, Literal
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M, RobotState
+from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
-from physics.robots import RobotModel
+from physics.robots import urdf_of
 from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
 from physics.world.bullet import p
@@ -41,11 +42,11 @@ Moving = Literal["pedestrian", "vehicle"]
 class Bodies:
     """A running engine. Bodies that are not shown wait far below the ground for their next use."""
 
-    def __init__(self, model: RobotModel, substep_s: float) -> None:
+    def __init__(self, robot: Robot, substep_s: float) -> None:
         self._client: int = p.connect(p.DIRECT)
         if self._client < 0:
             raise EngineError("PyBullet did not start")
-        self._model = model
+        self._com_height_m = robot.com_height_m
         self._what: dict[int, tuple[BodyKind, str]] = {}
         self._pools: dict[Any, list[int]] = {}
         self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
@@ -59,13 +60,11 @@ class Bodies:
             deterministicOverlappingPairs=1,
             enableConeFriction=0,
         )
-        self._robot: int = self._do("loadURDF", str(model.urdf), flags=p.URDF_USE_INERTIA_FROM_FILE)
+        self._robot: int = self._do("loadURDF", str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE)
         infos = [self._do("getJointInfo", self._robot, j) for j in range(self._do("getNumJoints", self._robot))]
         joints = {info[1].decode(): info[0] for info in infos}
-        self._left = [joints[name] for name in model.left]
-        self._right = [joints[name] for name in model.right]
-        self._wheels = self._left + self._right
-        self._torques = [model.torque_nm] * len(self._wheels)
+        self._wheels = [joints[name] for name in robot.drive.joints]
+        self._torques = [robot.drive.torque_nm] * len(self._wheels)
         self._do("changeDynamics", self._robot, -1, lateralFriction=0.4, linearDamping=0.0, angularDamping=0.0)
         for wheel in self._wheels:
             self._do("changeDynamics", self._robot, wheel, linearDamping=0.0, angularDamping=0.0, **_TYRE)
@@ -188,20 +187,20 @@ class Bodies:
     def place_robot(self, xyz_m: tuple[float, float, float], roll_pitch_yaw: tuple[float, float, float]) -> None:
         """The robot at rest with its base frame there."""
         turn = p.getQuaternionFromEuler(roll_pitch_yaw)
-        m, h = p.getMatrixFromQuaternion(turn), self._model.com_height_m
+        m, h = p.getMatrixFromQuaternion(turn), self._com_height_m
         middle = [c + h * up for c, up in zip(xyz_m, (m[2], m[5], m[8]), strict=True)]
         self._do("resetBasePositionAndOrientation", self._robot, middle, turn)
         self._do("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for wheel in self._wheels:
             self._do("resetJointState", self._robot, wheel, 0.0, 0.0)
 
-    def turn_wheels(self, left_radps: float, right_radps: float) -> None:
-        speeds = [left_radps] * len(self._left) + [right_radps] * len(self._right)
+    def turn_wheels(self, speeds_radps: Sequence[float]) -> None:
+        """Let the motors turn the drive's joints, in the order of `Skid.joints`, until told otherwise."""
         p.setJointMotorControlArray(
             self._robot,
             self._wheels,
             p.VELOCITY_CONTROL,
-            targetVelocities=speeds,
+            targetVelocities=speeds_radps,
             forces=self._torques,
             physicsClientId=self._client,
         )
@@ -231,7 +230,7 @@ class Bodies:
         """Position of the base frame, and its rotation row by row. The engine reports the centre of mass."""
         (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
         m: tuple[float, ...] = p.getMatrixFromQuaternion(turn)
-        h = self._model.com_height_m
+        h = self._com_height_m
         return (x - h * m[2], y - h * m[5], z - h * m[8]), m
 
     def robot_contacts(self) -> set[tuple[BodyKind, str]]:

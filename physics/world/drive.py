@@ -11,7 +11,7 @@ import math
 from typing import Final
 
 from cosim.core.state import Command
-from physics.robots import RobotModel
+from cosim.spec.robot import Robot
 
 _FORWARD: Final = 1.2
 _PROPORTIONAL: Final = 0.5
@@ -22,8 +22,8 @@ _EXTRA_MAX_RADPS: Final = 2.0
 class SkidDrive:
     """The drive of one robot; remembers its ramps and the yaw loop's integral."""
 
-    def __init__(self, model: RobotModel) -> None:
-        self._model = model
+    def __init__(self, robot: Robot) -> None:
+        self._robot = robot
         self.reset()
 
     def reset(self) -> None:
@@ -32,22 +32,22 @@ class SkidDrive:
         self._w_radps = 0.0
         self._extra_radps = 0.0
 
-    def wheel_speeds(self, command: Command, w_radps: float, dt_s: float) -> tuple[float, float]:
-        """Speeds of the left and right wheels in rad/s, given the measured yaw rate; one call per substep."""
-        model = self._model
-        v_goal = min(max(command.v_mps, -model.v_max_mps), model.v_max_mps)
-        w_goal = min(max(command.w_radps, -model.w_max_radps), model.w_max_radps)
-        self._v_mps = _towards(self._v_mps, v_goal, model.acceleration_mps2 * dt_s)
-        self._w_radps = _towards(self._w_radps, w_goal, model.acceleration_radps2 * dt_s)
+    def joint_speeds(self, command: Command, w_radps: float, dt_s: float) -> list[float]:
+        """Speeds of the wheels in rad/s, in the order of `Skid.joints`, given the measured yaw rate; one call per
+        substep. The command is within the robot's limits (`cosim.episode.control`)."""
+        robot, skid = self._robot, self._robot.drive
+        self._v_mps = _towards(self._v_mps, command.v_mps, robot.acceleration_mps2 * dt_s)
+        self._w_radps = _towards(self._w_radps, command.w_radps, robot.acceleration_radps2 * dt_s)
         if self._v_mps == 0.0 and self._w_radps == 0.0:
             self._extra_radps = 0.0
-            return 0.0, 0.0
+            return [0.0] * len(skid.joints)
         error = self._w_radps - w_radps
         extra = self._extra_radps + _INTEGRAL_HZ * error * dt_s
         self._extra_radps = min(max(extra, -_EXTRA_MAX_RADPS), _EXTRA_MAX_RADPS)
         turn = _FORWARD * self._w_radps + _PROPORTIONAL * error + self._extra_radps
-        apart = 0.5 * model.track_m * turn
-        return (self._v_mps - apart) / model.wheel_radius_m, (self._v_mps + apart) / model.wheel_radius_m
+        apart, radius_m = 0.5 * skid.span_m[1] * turn, skid.wheel_radius_m
+        left, right = (self._v_mps - apart) / radius_m, (self._v_mps + apart) / radius_m
+        return [left] * len(skid.left) + [right] * len(skid.right)
 
 
 def _towards(value: float, goal: float, step: float) -> float:

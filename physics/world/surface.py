@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.core.geometry import Floats, Pose
-from physics.robots import RobotModel
 from physics.street.buildings import Building
 from physics.street.furniture import Prop
 from physics.street.props import SignalPost
@@ -66,7 +65,7 @@ class Surface(ABC):
 
     seed: int = 0
     level: bool = False
-    _leant: tuple[Pose, RobotModel, tuple[float, float, float]] | None = None
+    _leant: tuple[Pose, tuple[float, float], tuple[float, float, float]] | None = None
 
     @abstractmethod
     def heights(self, xy: ArrayLike) -> Floats:
@@ -120,16 +119,16 @@ class Surface(ABC):
         corners = np.stack([at + ahead + left, at + ahead - left, at - ahead + left, at - ahead - left], axis=1)
         return self.land(corners.reshape(-1, 2)).reshape(-1, 4)
 
-    def lean(self, pose: Pose, model: RobotModel) -> tuple[float, float, float]:
-        """How a robot stands at a pose: height of the base frame in metres, roll and pitch in radians. Who asks for the
-        same pose again gets the last answer."""
-        if self._leant is None or self._leant[0] != pose or self._leant[1] is not model:
-            self._leant = pose, model, self._lean(pose, model)
+    def lean(self, pose: Pose, span_m: tuple[float, float]) -> tuple[float, float, float]:
+        """How a robot whose feet span this length and width stands at a pose: height of the base frame in metres, roll
+        and pitch in radians. Who asks for the same pose again gets the last answer."""
+        if self._leant is None or self._leant[:2] != (pose, span_m):
+            self._leant = pose, span_m, self._lean(pose, span_m)
         return self._leant[2]
 
-    def _lean(self, pose: Pose, model: RobotModel) -> tuple[float, float, float]:
+    def _lean(self, pose: Pose, span_m: tuple[float, float]) -> tuple[float, float, float]:
         cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
-        ahead, aside = 0.5 * model.wheelbase_m, 0.5 * model.track_m
+        ahead, aside = 0.5 * span_m[0], 0.5 * span_m[1]
         feet = [(a * ahead, b * aside) for a in (1, -1) for b in (1, -1)]
         at = [(pose.x_m + cos * u - sin * v, pose.y_m + sin * u + cos * v) for u, v in feet]
         front_left, front_right, rear_left, rear_right = self.heights(at).tolist()

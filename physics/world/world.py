@@ -15,8 +15,8 @@ import numpy as np
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, write_protected
+from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier
-from physics.robots import robot as robot_model
 from physics.world.bodies import Bodies
 from physics.world.drive import SkidDrive
 from physics.world.movers import Movers
@@ -40,23 +40,23 @@ class BulletWorld:
         self,
         surface: Surface,
         barriers: Sequence[Barrier] = (),
-        robot: str = "courier",
+        robot: Robot = COURIER,
     ) -> None:
         self.surface = surface
-        self.model = robot_model(robot)
+        self.robot = robot
         self.barriers = tuple(barriers)
-        self._drive = SkidDrive(self.model)
+        self._drive = SkidDrive(robot)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
 
     @property
     def footprint_m(self) -> tuple[float, float]:
         """Length and width of the robot."""
-        return self.model.length_m, self.model.width_m
+        return self.robot.footprint_m
 
     def __enter__(self) -> Self:
         if self._bodies is None:
-            self._bodies = Bodies(self.model, SUBSTEP_S)
+            self._bodies = Bodies(self.robot, SUBSTEP_S)
             for barrier in self.barriers:
                 size = (barrier.thickness_m, barrier.length_m)
                 z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
@@ -80,7 +80,7 @@ class BulletWorld:
         bodies = self._engine
         self._stream(pose.x_m, pose.y_m)
         self._drive.reset()
-        z, roll, pitch = self.surface.lean(pose, self.model)
+        z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
 
@@ -108,8 +108,7 @@ class BulletWorld:
         for k in range(substeps):
             bodies.move("pedestrian", people_poses[k])
             bodies.move("vehicle", car_poses[k])
-            left, right = self._drive.wheel_speeds(command, bodies.yaw_rate(), SUBSTEP_S)
-            bodies.turn_wheels(left, right)
+            bodies.turn_wheels(self._drive.joint_speeds(command, bodies.yaw_rate(), SUBSTEP_S))
             bodies.step()
             trace[k] = bodies.robot_pose()
             found += [Contact(kind, other, k) for kind, other in bodies.robot_contacts()]

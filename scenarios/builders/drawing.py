@@ -12,6 +12,7 @@ import shapely
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap
+from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 
 TRIES: Final = 400
@@ -67,6 +68,7 @@ def events_along(
     seed: int,
     scenario_id: str,
     time_limit_s: float,
+    robot: Robot = COURIER,
 ) -> Scenario:
     """A scenario from one end of a route to the other, with nothing else in it yet: its builder adds that."""
     start, goal = route.at(0.0), route.at(route.length_m)
@@ -80,4 +82,5 @@ def events_along(
         route=tuple((float(x), float(y)) for x, y in route.points),
         crossings=crossings,
         time_limit_s=time_limit_s,
+        robot=robot.name,
     )

@@ -13,11 +13,10 @@ from shapely.geometry import LineString, Point
 from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.telling import Tell, untold
 from cosim.place.street_map import StreetMap, WalkableArea
+from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite
 from cosim.spec.spec_file import in_lines
 from physics.cameras.hdri import read_hdri
-from physics.robots import ROBOTS
-from physics.robots import robot as robot_model
 from scenarios.builders.barriers import outline
 from scenarios.execution.places import place
 from sumo_nets.crowd.room import Room
@@ -108,8 +107,8 @@ def _on(scenario: Scenario, crossing: RouteCrossing) -> Point:
 def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Barriers that close what is not there, stand elsewhere, or stand in the robot's way."""
     route = LineString(scenario.route)
-    model = ROBOTS.get(scenario.robot)
-    half_width_m = 0.0 if model is None else model.width_m / 2
+    robot = ROBOTS.get(scenario.robot)
+    half_width_m = 0.0 if robot is None else robot.width_m / 2
     for number, barrier in enumerate(scenario.barriers):
         strip, fence = street_map.strips.get(barrier.strip), outline(barrier)
         if strip is None:
@@ -137,7 +136,7 @@ def _not_here(scenarios: Iterable[Scenario]) -> Iterator[str]:
     robots, skies = ({getattr(s, name): s.id for s in scenarios} for name in ("robot", "light"))
     for robot, scenario_id in robots.items():
         try:
-            robot_model(robot)
+            robot_called(robot)
         except UsageError as error:
             yield f"scenario '{scenario_id}': {error}"
     for light, scenario_id in skies.items():

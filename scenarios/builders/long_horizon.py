@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence, Set
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -16,13 +17,15 @@ from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Event
+from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
 from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of
 from scenarios.builders.hems import hem
 from scenarios.events import EVENT_KINDS
 
-HALF_WIDTH_M = 0.32
+_TO_SPARE_M = 0.045
+"""The way is wider than the robot by this on either side."""
 IN_GROUPS = 0.3
 """Share of the walkers that walk in groups of two and three."""
 
@@ -31,8 +34,8 @@ ON_ROAD_M = 2.0
 
 CROSSING_EVERY_M = 160.0
 EVENT_EVERY_M = 90.0
-EVENT_WALKWAY_M = 3.0
-"""Events take place on sidewalks at least this wide: there is room to pass."""
+BESIDE_EVENT_M = 0.95
+"""Events take place on sidewalks whose halves are wider than the robot by this: there is room to pass."""
 
 SEARCHES = 150
 """So many ways are searched for where no draw fits."""
@@ -51,7 +54,28 @@ EVENT_STRAIGHT_M = 24.0
 EVENT_BEND_M = 0.4
 
 
-def build_long_horizon(place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str) -> Scenario:
+class _Draft(NamedTuple):
+    """What every draw of a scenario has in common."""
+
+    place: Place
+    street_map: StreetMap
+    graph: WalkGraph
+    seed: int
+    scenario_id: str
+    robot: Robot
+
+    @property
+    def half_width_m(self) -> float:
+        """Half of what the way is wide, at least."""
+        return self.robot.width_m / 2 + _TO_SPARE_M
+
+
+_Fences = Callable[[_Draft, Polyline, Sequence[Port]], tuple[Barrier, ...]]
+
+
+def build_long_horizon(
+    place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str, robot: Robot = COURIER
+) -> Scenario:
     """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are searched for that can be
     fenced in all along. Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
@@ -63,10 +87,10 @@ def build_long_horizon(place: Place, street_map: StreetMap, graph: WalkGraph, se
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
+    draft = _Draft(place, street_map, graph, seed, scenario_id, robot)
     drawn, searched = Refusals(), Refusals()
-    draws = (lambda: _draw(place, street_map, graph, rng, candidates, seed, scenario_id) for _ in range(TRIES))
-    search = _search(place, street_map, graph, candidates, seed, scenario_id)
-    found = first_of(draws, drawn) or first_of(search, searched)
+    draws = (lambda: _along(draft, rng, draw_way(street_map, graph, rng, candidates), _barriers) for _ in range(TRIES))
+    found = first_of(draws, drawn) or first_of(_search(draft, candidates), searched)
     if found is None:
         reason = searched.most_frequent
         remedy = next((words for start, words in REMEDIES.items() if reason.startswith(start)), REMEDIES[""])
@@ -75,56 +99,37 @@ def build_long_horizon(place: Place, street_map: StreetMap, graph: WalkGraph, se
     return found
 
 
-def _draw(
-    place: Place,
-    street_map: StreetMap,
-    graph: WalkGraph,
-    rng: np.random.Generator,
-    candidates: Sequence[str],
-    seed: int,
-    scenario_id: str,
-) -> Scenario:
-    way, start_m, goal_m = draw_way(street_map, graph, rng, candidates)
-    return _along(place, street_map, rng, way, (start_m, goal_m), _barriers, seed, scenario_id)
-
-
 def _along(
-    place: Place,
-    street_map: StreetMap,
-    rng: np.random.Generator,
-    way: Sequence[Port],
-    ends_m: tuple[float, float],
-    fences: Callable[[StreetMap, Polyline, Sequence[Port]], tuple[Barrier, ...]],
-    seed: int,
-    scenario_id: str,
+    draft: _Draft, rng: np.random.Generator, drawn: tuple[Sequence[Port], float, float], fences: _Fences
 ) -> Scenario:
-    """The scenario along a way. Raises SpecError when the way does not do."""
+    """The scenario along a way, as `draw_way` gives it. Raises SpecError when the way does not do."""
+    (way, *ends_m), street_map = drawn, draft.street_map
     route = Polyline(np.round(way_line(street_map, way, *ends_m).points, 3))
     if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
-    barriers = fences(street_map, route, way)
+    barriers = fences(draft, route, way)
     bare = events_along(
         route,
         crossings,
-        place,
+        draft.place,
         street_map,
         suite="long-horizon",
-        seed=seed,
-        scenario_id=scenario_id,
+        seed=draft.seed,
+        scenario_id=draft.scenario_id,
         time_limit_s=max(300.0, route.length_m / 0.2),
+        robot=draft.robot,
     )
-    events = draw_events(street_map, route, way, rng)
+    events = draw_events(street_map, route, way, rng, 2.0 * (draft.robot.width_m + BESIDE_EVENT_M))
     return msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
 
 
-def _search(
-    place: Place, street_map: StreetMap, graph: WalkGraph, candidates: Sequence[str], seed: int, scenario_id: str
-) -> Iterator[Callable[[], Scenario]]:
+def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], Scenario]]:
     """More draws: of ways that keep off roads, stairs and bridges, fenced in all along where need be."""
-    rng = np.random.default_rng([seed, place.seed, 0x10E6, 1])
+    street_map = draft.street_map
+    rng = np.random.default_rng([draft.seed, draft.place.seed, 0x10E6, 1])
     sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
     shares = dict(zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True))
     avoided = {s.id for s in street_map.strips.values() if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE}
@@ -133,31 +138,31 @@ def _search(
     def draw() -> Scenario:
         if not usable:
             raise SpecError("every long sidewalk is a stair, a bridge, a tunnel or on a road")
-        way, start_m, goal_m = search_way(street_map, graph, rng, usable, avoided)
-        return _along(place, street_map, rng, way, (start_m, goal_m), _hemmed, seed, scenario_id)
+        return _along(draft, rng, search_way(street_map, draft.graph, rng, usable, avoided), _hemmed)
 
     return (draw for _ in range(SEARCHES if usable else 1))
 
 
-def _hemmed(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+def _hemmed(draft: _Draft, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
     """Barriers at the branches where they do, else all along the way. Raises SpecError when neither leave one path."""
     try:
-        return _barriers(street_map, route, way)
+        return _barriers(draft, route, way)
     except SpecError:
-        fences = hem(street_map, way)
-        prove_single_path(street_map, route, fences, way, HALF_WIDTH_M)
+        fences = hem(draft.street_map, way)
+        prove_single_path(draft.street_map, route, fences, way, draft.half_width_m)
         return fences
 
 
-def _barriers(street_map: StreetMap, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+def _barriers(draft: _Draft, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
     """Barriers that leave one path, square to their strips if possible. Raises SpecError when there are none."""
+    street_map = draft.street_map
     ports, ground = branches(street_map, way), ground_around(street_map, route, way)
     barriers = tuple(barrier_at(street_map, port) for port in ports)
     try:
-        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M, ground)
+        prove_single_path(street_map, route, barriers, way, draft.half_width_m, ground)
     except SpecError:
         barriers = tuple(barrier_at(street_map, port, slanting=True) for port in ports)
-        prove_single_path(street_map, route, barriers, way, HALF_WIDTH_M, ground)
+        prove_single_path(street_map, route, barriers, way, draft.half_width_m, ground)
     return barriers
 
 
@@ -236,13 +241,13 @@ def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteC
 
 
 def draw_events(
-    street_map: StreetMap, route: Polyline, way: Sequence[Port], rng: np.random.Generator
+    street_map: StreetMap, route: Polyline, way: Sequence[Port], rng: np.random.Generator, wide_m: float
 ) -> tuple[Event, ...]:
-    """Events about every EVENT_EVERY_M metres, on straight and wide pieces of sidewalk."""
+    """Events about every EVENT_EVERY_M metres, on straight pieces of sidewalk at least `wide_m` wide."""
     places = []
     for s_m in np.arange(35.0, route.length_m - 25.0, 5.0):
         strip = _sidewalk_at(street_map, way, route, float(s_m))
-        if strip is not None and strip.width_m >= EVENT_WALKWAY_M and _is_straight(route, float(s_m)):
+        if strip is not None and strip.width_m >= wide_m and _is_straight(route, float(s_m)):
             places.append((float(s_m), strip.width_m / 2))
     events: list[Event] = []
     next_s_m = 0.0

@@ -17,6 +17,7 @@ from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event
+from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.drawing import events_along, first_that_fits
 from scenarios.builders.long_horizon import route_crossings
@@ -47,7 +48,13 @@ class _EventSpot(NamedTuple):
 
 
 def build_reactive(
-    kind: EventKind, place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str
+    kind: EventKind,
+    place: Place,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    seed: int,
+    scenario_id: str,
+    robot: Robot = COURIER,
 ) -> Scenario:
     """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is found."""
     rng = np.random.default_rng([seed, place.seed, 0x4EAC7, zlib.crc32(kind.name.encode())])
@@ -59,7 +66,11 @@ def build_reactive(
 
     def draw() -> Scenario:
         strip, layout = strips[int(rng.integers(len(strips)))], kind.layout
-        at = _over_crossing(street_map, strip, rng) if layout is None else _along_sidewalk(layout, strip, rng)
+        at = (
+            _over_crossing(street_map, strip, rng, robot)
+            if layout is None
+            else _along_sidewalk(layout, strip, rng, robot)
+        )
         bare = events_along(
             Polyline(at.route),
             at.crossings,
@@ -69,16 +80,18 @@ def build_reactive(
             seed=seed,
             scenario_id=scenario_id,
             time_limit_s=_LIMIT_S,
+            robot=robot,
         )
-        event = _event_at(kind, at, rng)
+        event = _event_at(kind, at, rng, robot)
         return msgspec.structs.replace(bare, events=(event,), crowd=CROWD, ends_on_failure=True, ends_at=kind.ends_at)
 
     return first_that_fits(draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}")
 
 
-def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator) -> Event:
+def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: Robot) -> Event:
     fewest, most = kind.people
-    people = int(rng.integers(fewest, most + 1)) if kind.group is None else kind.group(at.half_width_m, rng)
+    half_m = at.half_width_m - 0.5 * _wider_m(robot)
+    people = int(rng.integers(fewest, most + 1)) if kind.group is None else kind.group(half_m, rng)
     return Event(
         id="e0",
         kind=kind.name,
@@ -94,9 +107,9 @@ def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator) -> Even
     )
 
 
-def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator) -> _EventSpot:
+def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
     half_m = strip.width_m / 2
-    if half_m < layout.half_width_m:
+    if half_m < layout.half_width_m + _wider_m(robot):
         raise SpecError("sidewalk too narrow")
     way_m, event_m = float(rng.uniform(*layout.way_m)), float(rng.uniform(*layout.event_m))
     reach_m = max(way_m, event_m)
@@ -116,14 +129,19 @@ def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generat
     return _EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
 
 
-def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator) -> _EventSpot:
+def _wider_m(robot: Robot) -> float:
+    """By how much a robot is wider than the one that the layouts of events are written for."""
+    return robot.width_m - COURIER.width_m
+
+
+def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
     leave: Literal[0, 1] = 1 if rng.random() < 0.5 else 0
     if not 5.0 <= strip.length_m <= 12.0 or None in strip.corners:
         raise SpecError("crossing too short or too long")
     if strip.signalised:
         raise SpecError("crossing signalised: waiting there takes longer than the episode")
     ends = strip.line[[0, -1], :2] if leave else strip.line[[-1, 0], :2]
-    route = Polyline(np.round(_straight_over(street_map, ends), 3)).resampled(0.99)
+    route = Polyline(np.round(_straight_over(street_map, ends, _ROOM_M + 0.5 * _wider_m(robot)), 3)).resampled(0.99)
     route = Polyline(np.round(route.points, 3))
     crossings = route_crossings(street_map, route, [Port(strip.id, 0 if leave else 1), Port(strip.id, leave)])
     enter_m, leave_m = crossings[0].enter_s_m, crossings[0].leave_s_m
@@ -132,15 +150,16 @@ def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator
     return _EventSpot(route.points, pose, middle_m, strip.width_m / 2, 0.5 * (leave_m - enter_m), crossings)
 
 
-def _straight_over(street_map: StreetMap, ends: Floats) -> Floats:
+def _straight_over(street_map: StreetMap, ends: Floats, room_m: float) -> Floats:
     """(2, 2) m: a way straight over a crosswalk, from before its first end to beyond its second, as far as one can walk
-    straight on there: who only drives straight ahead stays on it. Raises SpecError when that is too short."""
+    straight on there with `room_m` to either side: who only drives straight ahead stays on it. Raises SpecError when
+    that is too short."""
     along = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
     walkable = street_map.walkable_near(shapely.buffer(LineString(ends), BESIDE_CROSSING_M[1] + 1.0))
     reached = []
     for end, outward in ((ends[0], -along), (ends[1], along)):
         for far_m in np.arange(BESIDE_CROSSING_M[1], BESIDE_CROSSING_M[0] - 1e-9, -0.25):
-            beyond = shapely.buffer(LineString([end, end + far_m * outward]), _ROOM_M)
+            beyond = shapely.buffer(LineString([end, end + far_m * outward]), room_m)
             if shapely.covers(walkable, beyond):
                 reached.append(end + far_m * outward)
                 break

@@ -15,6 +15,7 @@ from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKind, EventKinds
+from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.builders import long_horizon, reactive
 from scenarios.events import EVENT_KINDS
@@ -36,13 +37,15 @@ def suite_on_map(
     roughness: float = 0.0,
     events: Sequence[str] = (),
     kinds: EventKinds = EVENT_KINDS,
+    robot: Robot = COURIER,
 ) -> Suite:
     """A suite drawn on a place, by whatever the user calls it; the same arguments and net give the same suite.
 
     count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one of each by default.
     events: which of them; those for which the place has no room are left out, and the description says so, unless they
     were asked for. Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
-    roughness: of the ground, from 0 (flat) to 1. kinds: the table of events that there are.
+    roughness: of the ground, from 0 (flat) to 1. kinds: the table of events that there are. robot: which one
+    the ways are wide enough for.
 
     Raises UsageError for another kind of suite, and whatever the place or the builder has to refuse.
     """
@@ -54,7 +57,7 @@ def suite_on_map(
     where = place_called(called, roughness)
     _, street_map = place(where)
     name = where.map if isinstance(where, CityMap) else where.name
-    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed, kinds)
+    drawn = _Drawn(where, street_map, WalkGraph(street_map), name, seed, kinds, robot)
     scenarios, left_out = drawn.long(count or 1) if kind == "long-horizon" else drawn.reactive(count, events)
     return Suite(
         name=kind,
@@ -73,13 +76,14 @@ class _Drawn(NamedTuple):
     name: str
     seed: int
     kinds: EventKinds
+    robot: Robot
 
     def long(self, count: int) -> tuple[list[Scenario], list[str]]:
         """So many long-horizon scenarios; nothing is left out."""
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
-        build = long_horizon.build_long_horizon
-        return [build(self.where, self.street_map, self.graph, n, i) for n, i in zip(seeds, ids, strict=True)], []
+        drawn_on, build = (self.where, self.street_map, self.graph), long_horizon.build_long_horizon
+        return [build(*drawn_on, seed, name, self.robot) for seed, name in zip(seeds, ids, strict=True)], []
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
         """So many reactive scenarios, their events in turn, and a sentence for each event there is no room for."""
@@ -105,7 +109,7 @@ class _Drawn(NamedTuple):
 
     def _one(self, kind: EventKind, seed: int) -> Scenario:
         scenario_id = f"{kind.name}-{self.name}-{seed:03d}"
-        return reactive.build_reactive(kind, self.where, self.street_map, self.graph, seed, scenario_id)
+        return reactive.build_reactive(kind, self.where, self.street_map, self.graph, seed, scenario_id, self.robot)
 
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:

@@ -80,7 +80,8 @@ class Episode:
         through: Callable[[StagedScenario], None] | None = None,
         kinds: EventKinds = EVENT_KINDS,
     ) -> None:
-        self.scenario, self.manifest, self.options = scenario, manifest, options
+        self.scenario = scenario = scenario.driven_by(options.robot)
+        self.manifest, self.options = manifest, options
         self.clock = Clock.for_rate(manifest.rate_hz)
         self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source)
         self._watches, self._waiting, self._through, self._kinds = list(watches), waiting, through, kinds
@@ -170,7 +171,7 @@ class Episode:
         if self.over:
             raise UsageError(f"this Episode is over ({self._verdict.ended}): ask for its result(), or make another")
         try:
-            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, limits=stage.limits)
+            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, robot=stage.robot)
         except PolicyError as error:
             raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
         frame = self._frame
@@ -200,7 +201,9 @@ class Episode:
         self._frame = parts.camera.render(now.robot, now.street) if parts.camera is not None else None
         known = stage.known(now) if self.manifest.privileged else None
         rgb = self._frame.rgb if self._frame is not None else None
-        return Observation(now.tick, self.clock.time_s(now.tick), rgb, now.robot.v_mps, now.robot.w_radps, known)
+        return Observation(
+            now.tick, self.clock.time_s(now.tick), rgb, now.robot.v_mps, now.robot.w_radps, stage.robot, known
+        )
 
     @property
     def _open(self) -> StagedScenario:

@@ -56,7 +56,7 @@ def run_episode(
         return Outcome(crashed, None, traceback.format_exc())
     if options.counterfactual:
         try:
-            measures = record.measures | beside.compared(scenario, entrances, comparing).measures
+            measures = record.measures | beside.compared(episode.scenario, entrances, comparing).measures
             record = msgspec.structs.replace(record, measures=measures)
         except Exception as error:  # noqa: BLE001  the episode itself is over and sound
             trouble = traceback.format_exc()

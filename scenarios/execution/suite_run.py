@@ -22,7 +22,7 @@ from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from scenarios.builders.fits import check_places
-from scenarios.catalog import load_suite, scenarios_chosen
+from scenarios.catalog import load_suite, scenarios_chosen, with_robot
 from scenarios.execution.messages import Hello
 from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
@@ -55,7 +55,7 @@ def run(
     >>> run("reactive", "straight", scenarios=["obstructing-001"])[["scenario", "success"]].to_dict("records")
     [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
-    whole = load_suite(suite) if isinstance(suite, str) else suite
+    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
     picked = scenarios_chosen(whole, scenarios, episodes, events)
     check_places(whole, picked)
     driver = load_policy(policy) if isinstance(policy, str) else Driver.of(policy)
@@ -87,6 +87,7 @@ def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driv
     manifest = driver.manifest
     return RunSpec(
         suite=whole.name,
+        robot=", ".join(sorted({scenario.robot for scenario in picked})),
         suite_version=whole.version,
         suite_hash=whole.content_hash,
         policy=policy,

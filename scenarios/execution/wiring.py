@@ -12,7 +12,6 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
-from cosim.episode.control import Limits
 from cosim.episode.loop import Moment, Parts
 from cosim.episode.ports import CameraSpec, Eyes, Manifest, Privileged
 from cosim.place import overlay
@@ -20,10 +19,10 @@ from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import Barrier, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
-from physics.robots import robot
 from physics.street.furniture import Prop, footprints
 from physics.world.street_surface import StreetSurface
 from physics.world.surface import Surface
@@ -46,12 +45,12 @@ FRONTAGE_M = 2.0
 
 @dataclass(slots=True)
 class StagedScenario:
-    """A scenario ready to run. parts: its engines; limits: of the robot. renderer: what draws for the policy. known:
+    """A scenario ready to run. parts: its engines; robot: which one drives. renderer: what draws for the policy. known:
     all that the simulator knows at a moment. eyes: makes further cameras. injected: takes pedestrians in. entrances:
     who comes and goes in the street."""
 
     parts: Parts
-    limits: Limits
+    robot: Robot
     renderer: str
     scorer: Scorer
     known: Callable[[Moment], Privileged]
@@ -77,7 +76,8 @@ def staged(
     walkable = street_map.walkable_near(around)
     with ExitStack() as stack:
         street = StreetSurface(street_map, scenario.place.seed, scenario.place.unevenness)
-        world = stack.enter_context(world_of(street, scenario.barriers, scenario.robot))
+        robot = robot_called(scenario.robot)
+        world = stack.enter_context(world_of(street, scenario.barriers, robot))
         crowd = stack.enter_context(crowd_of(scenario))
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
@@ -90,13 +90,13 @@ def staged(
         director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
         footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
-        free = shapely.buffer(footing, -world.footprint_m[1] / 2)
+        free = shapely.buffer(footing, -robot.width_m / 2)
         shapely.prepare(free)
         yield StagedScenario(
             parts=Parts(world, crowd, injected, camera),
-            limits=Limits(),
+            robot=robot,
             renderer=renderer,
-            scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), world.footprint_m, clock),
+            scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot.footprint_m, clock),
             known=partial(known, scenario, free),
             eyes=eyes,
             injected=injected,
@@ -104,7 +104,7 @@ def staged(
         )
 
 
-def world_of(surface: Surface, barriers: Sequence[Barrier] = (), robot: str = "courier") -> BulletWorld:
+def world_of(surface: Surface, barriers: Sequence[Barrier] = (), robot: Robot = COURIER) -> BulletWorld:
     """The physics of a surface, not running yet."""
     return BulletWorld(surface, barriers, robot)
 
@@ -113,9 +113,8 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd:
     """The street life of a scenario, not running yet. before: who comes and goes, in place of who would be drawn."""
     net_path, street_map = place(scenario.place)
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-    model, start_xy = robot(scenario.robot), scenario.start[:2]
-    outline_m = (model.length_m, model.width_m)
-    return SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, outline_m, before)
+    robot, start_xy = robot_called(scenario.robot), scenario.start[:2]
+    return SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, robot.footprint_m, before)
 
 
 def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:

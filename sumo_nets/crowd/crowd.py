@@ -27,6 +27,7 @@ from cosim.people.gait import Strides
 from cosim.people.yielding import RobotBody
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
 from sumo_nets.crowd.demand_log import DRIVERS, PEDESTRIANS, Entrances, Kept
@@ -51,6 +52,9 @@ SIGNAL_CLOCK_S = 3600
 
 NOWHERE_M = -1e8
 """Who has not set out yet is beyond this."""
+
+_BERTH_M = (0.3, 0.45)
+"""To SUMO's walkers the robot is so much longer and wider than it is: they pass it wide."""
 
 EYE = "robot"
 Row = dict[int, Any]
@@ -80,7 +84,7 @@ class SumoCrowd(Crowd):
         seed: int,
         closed: frozenset[Port],
         start_xy: tuple[float, float],
-        footprint_m: tuple[float, float] = (0.7, 0.55),
+        footprint_m: tuple[float, float] = COURIER.footprint_m,
         before: Entrances | None = None,
     ) -> None:
         self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
@@ -164,7 +168,8 @@ class SumoCrowd(Crowd):
 
     def _populate(self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator) -> None:
         x_m, y_m = self._start_xy
-        for kind, length_m, width_m, gap_m in (("robot", 1.0, 1.0, 0.5), ("event", 0.5, 0.8, 0.25)):
+        robot_m = (2.0 * self._half_m[0] + _BERTH_M[0], 2.0 * self._half_m[1] + _BERTH_M[1])
+        for kind, (length_m, width_m), gap_m in (("robot", robot_m, 0.5), ("event", (0.5, 0.8), 0.25)):
             libsumo.vehicletype.copy("DEFAULT_PEDTYPE", kind)
             libsumo.vehicletype.setLength(kind, length_m)
             libsumo.vehicletype.setWidth(kind, width_m)

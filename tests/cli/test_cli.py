@@ -377,7 +377,7 @@ def test_a_suite_that_does_not_fit_its_place_is_refused(desk: Path, cosim: Cosim
     assert head == "error: suite 'four': 5 faults:" and len(faults) == 5
     for words in (
         "scenario 't-0': start is off the walkable area at (-50.00, -50.00)", "scenario 't-0': crossing ",
-        "scenario 't-1': ", "the net's hash is ", "scenario 't-2': unknown robot 'tank'. Valid choices: courier",
+        "scenario 't-1': ", "the net's hash is ", "scenario 't-2': unknown robot 'tank'. Valid choices: courier, scout",
         "scenario 't-3': unknown map 'atlantis'",
     ):  # fmt: skip
         assert sum(words in fault for fault in faults) == 1, (words, faults)

@@ -10,13 +10,12 @@ import pytest
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, SpecError
 from cosim.core.state import Command
-from cosim.episode.control import Limits, command_from_waypoint, command_of
-
-LIMITS = Limits()
+from cosim.episode.control import command_from_waypoint, command_of
+from cosim.spec.robot import COURIER
 
 
 def of(answer: object) -> Command:
-    return command_of(answer, waypoint_dt_s=0.25, limits=LIMITS)
+    return command_of(answer, waypoint_dt_s=0.25, robot=COURIER)
 
 
 def test_a_waypoint_becomes_the_fields_pd_command() -> None:

@@ -17,6 +17,7 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
 from cosim.episode.driver import Driver, PolicyCall
 from cosim.episode.ports import Manifest, Observation, Privileged
+from cosim.spec.robot import COURIER
 
 MINE = Manifest("mine", camera=None)
 
@@ -37,7 +38,7 @@ class Fake:
 
 
 def seen(tick: int = 0, known: Privileged | None = None) -> Observation:
-    return Observation(tick, 0.05 * tick, np.full((4, 4, 3), 7, np.uint8), 0.5, 0.0, known)
+    return Observation(tick, 0.05 * tick, np.full((4, 4, 3), 7, np.uint8), 0.5, 0.0, COURIER, known)
 
 
 def knowledge() -> Privileged:

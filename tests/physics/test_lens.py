@@ -11,15 +11,16 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import Frame, RobotState
 from cosim.episode.ports import CameraSpec, Lens
+from cosim.spec.robot import Mount
 from physics.cameras.lens import drawn, exposure_gain, through
 
 STILL = RobotState(Pose(0.0, 0.0, 0.0))
-FLAT = {"pitch_down_deg": 0.0, "mount_m": (0.0, 0.0, 0.6)}
+FLAT = Mount((0.0, 0.0, 0.6))
 
 
 def spec(lens: Lens, width: int = 200, height: int = 100) -> CameraSpec:
     """A camera with a focal length of 100 pixels."""
-    return CameraSpec(width, height, 2 * math.degrees(math.atan(0.005 * height)), lens=lens, **FLAT)  # type: ignore[arg-type]
+    return CameraSpec(width, height, 2 * math.degrees(math.atan(0.005 * height)), FLAT, lens)
 
 
 def flat(camera: CameraSpec, value: int) -> Frame:

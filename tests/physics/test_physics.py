@@ -13,9 +13,10 @@ from cosim.core.errors import EngineError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.episode.ports import CameraSpec
+from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import Barrier
 from physics.cameras.bullet_camera import BulletCamera
-from physics.robots import ROBOTS, robot
+from physics.robots import urdf_of
 from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from tests.tiny_street import tiny_map
@@ -183,8 +184,8 @@ def test_a_world_outside_its_with_block_says_so() -> None:
 def test_an_unknown_robot_lists_the_known() -> None:
     """A wrong name is a usage error with the choices."""
     with pytest.raises(UsageError, match="Valid choices: courier"):
-        robot("rover")
-    assert all(model.urdf.is_file() for model in ROBOTS.values())
+        robot_called("rover")
+    assert all(urdf_of(robot).is_file() for robot in ROBOTS.values())
 
 
 SPEC = CameraSpec(width=96, height=96)

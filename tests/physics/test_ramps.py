@@ -21,6 +21,7 @@ from cosim.episode.ports import Observation, Privileged
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap, Strip, WalkableArea
 from cosim.policies.route import Route
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, square
@@ -81,7 +82,7 @@ def climb(world: BulletWorld, line: Polyline) -> Climb:
     while reached < line.length_m - 0.4 and clock.time_s(tick) < 5.0 + 2.5 * line.length_m / V_MPS:
         if clock.acts(tick):
             known = Privileged(state, line, reached, NOBODY, NO_VEHICLES, {}, (), free)
-            seen = Observation(tick, clock.time_s(tick), None, state.v_mps, state.w_radps, known)
+            seen = Observation(tick, clock.time_s(tick), None, state.v_mps, state.w_radps, COURIER, known)
             command = driver.act(seen)
         state = world.step(command, street, street, clock.substeps).robot
         reached = place_on_route(line, state.pose, reached)

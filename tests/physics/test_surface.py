@@ -15,11 +15,11 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import LABELS, Command, Frame, RobotState, Street
 from cosim.episode.ports import CameraSpec
+from cosim.spec.robot import COURIER
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
 from physics.cameras.view import shot
-from physics.robots import robot
 from physics.world.mesh_surface import Z_UP, MeshSurface
 from physics.world.tiles import key_at, keys_within, square
 from physics.world.world import BulletWorld
@@ -67,7 +67,7 @@ def test_a_mesh_has_its_heights_and_lean(surface: MeshSurface) -> None:
     x = np.array([-4.0, -0.1, 0.41, 2.0, 5.9, 6.1, 13.0])
     assert surface.heights(np.column_stack([x, 0.3 * x])) == pytest.approx([height(at) for at in x], abs=1e-6)
     for heading, roll, pitch in ((0.0, 0.0, -1.0), (math.pi, 0.0, 1.0), (math.pi / 2, -1.0, 0.0)):
-        z, leant, nodding = surface.lean(Pose(3.0, 1.0, heading), robot("courier"))
+        z, leant, nodding = surface.lean(Pose(3.0, 1.0, heading), COURIER.drive.span_m)
         assert z == pytest.approx(3.0 * GRADE, abs=1e-6)
         assert (leant, nodding) == pytest.approx((roll * math.atan(GRADE), pitch * math.atan(GRADE)), abs=1e-6)
     lying = surface.road([(3.0, 0.0)], [0.0], [(4.5, 1.8)])[0]

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cosim.core.geometry import Pose
 from cosim.place.street_map import Corner, Port
 from cosim.place.terrain import FALSE_GRADE, ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation, Terrain
-from physics.robots import robot
+from cosim.spec.robot import COURIER
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, RAMP_SLOPE, build_tile, key_at, kind_of, square
 from sumo_nets.net.elevation import steep_ports, steep_strips, surveyed
@@ -298,6 +298,6 @@ def test_flat_ground_is_what_it_was() -> None:
     points = np.random.default_rng(2).uniform(-40.0, 40.0, (300, 2))
     assert flat.heights(points).tolist() == level.heights(points).tolist()
     pose = Pose(0.5, 4.0, 0.7)
-    assert flat.lean(pose, robot("courier")) == level.lean(pose, robot("courier"))
+    assert flat.lean(pose, COURIER.drive.span_m) == level.lean(pose, COURIER.drive.span_m)
     assert flat.road([(3.0, 1.0)], [1.0], [(4.0, 2.0)]).tolist() == [[0.0, 0.0, 0.0]]
     assert FALSE_GRADE > ROBOT_GRADE_MAX > WALK_GRADE_MAX

@@ -17,6 +17,7 @@ from cosim.policies.load import load_policy
 GOOD = """
 from cosim.episode.ports import CameraSpec, Manifest
 from cosim.core.state import STILL
+from cosim.spec.robot import Mount
 class Mine:
     manifest = Manifest("mine"{fields})
     def reset(self, scenario_id, seed): pass
@@ -46,8 +47,8 @@ BAD = {
     "no-pixels": (GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"), "sides of 1 to 4096 pixels, not 0 x 96"),
     "fish-eye": (GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"), "fov_deg must be between 0 and 180"),
     "lost-mount": (
-        GOOD.replace("{fields}", ", camera=CameraSpec(mount_m=(0.0, float('inf'), 0.0))"),
-        "mount_m and pitch_down_deg must be finite",
+        GOOD.replace("{fields}", ", camera=CameraSpec(mount=Mount((0.0, float('inf'), 0.0)))"),
+        "mount at_m and pitch_down_deg must be finite",
     ),
 }
 

@@ -15,10 +15,12 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, Doing, People, RobotState, Signal, Vehicles
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Observation, Privileged
+from cosim.policies.body import BodyDisks
 from cosim.policies.foresight import COMMITS_M, STEP_S, STEPS, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Orca, car_nearness, lane_past, stop_limit
 from cosim.policies.route import crossing_limit
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec
 from scenarios.events import EVENT_KINDS
 
@@ -56,7 +58,7 @@ def test_a_group_is_passed_round_on_the_side_with_room() -> None:
     """Two talkers stand 1.5 m apart across the way, nearer to its left edge: the lane leads to the right of both."""
     crowd = people((11.0, 1.2, 0.0, 0.0, "talk"), (11.0, -0.3, 0.0, 0.0, "talk"))
     scene = known(crowd)
-    lane_m = lane_past(scene, Way(ROUTE), scene.free, lines(crowd), 0.0)
+    lane_m = lane_past(scene, BodyDisks.of(COURIER), Way(ROUTE), scene.free, lines(crowd), 0.0)
     assert lane_m <= -0.3 - 0.3 - 0.33 - 0.1
 
 
@@ -69,7 +71,7 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
     driver = Driver(Orca())
     x_m, v_mps = 3.0, 0.0
     for tick in range(300):
-        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, known(hand, x_m, v_mps)))
+        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, known(hand, x_m, v_mps)))
         v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
         x_m += 0.1 * v_mps
     assert v_mps == 0.0
@@ -84,13 +86,15 @@ def test_who_waits_at_red_does_not_start_because_it_has_crept_nearer(
 ) -> None:
     """0.2 m before a crossing: at rest it waits for green; at speed it can stop no more, and drives on."""
     here = replace(known(people(), 5.0, v_mps), crossings=((":c0", 5.2, 12.0),), signals={":c0": Signal(walk, 30.0)})
-    assert crossing_limit(here) == limit_mps
+    assert crossing_limit(here, COURIER) == limit_mps
 
 
 def test_foresight_turns_no_faster_than_the_robot() -> None:
     """Every plan keeps to the yaw rate and the speed of the robot, and to its lane in the end."""
     plans = Plans(np.array([0.0, 1.0, -1.0]), np.array([1.4, 1.4, 0.9]), np.full(3, 0.9), np.array([0.0, 0.0, 0.6]))
-    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2)))
+    ahead = foresee(
+        Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2))
+    )
     turns = np.abs(np.diff(ahead.pose[..., 2], axis=0))
     moved = np.hypot(*np.moveaxis(np.diff(ahead.pose[..., :2], axis=0), -1, 0))
     assert turns.max() <= 0.65 * STEP_S + 1e-9 and moved.max() <= 1.4 * STEP_S + 1e-9
@@ -101,7 +105,7 @@ def test_somebody_who_walks_at_the_robot_is_foreseen_to_aim_at_it_and_then_to_co
     """A robot that swerves early is followed; once they are COMMITS_M apart the walker keeps its line."""
     plans = Plans(np.array([1.5]), np.array([1.0]), np.array([0.9]), np.array([0.0]))
     start, walk = np.array([[14.0, 0.0]]), np.array([[-1.4, 0.0]])
-    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.0, 0.0), start, walk)
+    ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.0, 0.0), start, walk)
     track = np.vstack([start, ahead.people[:, 0, 0]])
     steps = np.diff(track, axis=0)
     heading = np.arctan2(steps[:, 1], steps[:, 0])
@@ -113,11 +117,13 @@ def test_somebody_who_walks_at_the_robot_is_foreseen_to_aim_at_it_and_then_to_co
 def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_half_a_metre() -> None:
     """At 6 m/s it needs 6 m to stop: one 12 m off does not matter, one 5 m off stands in every plan's way alike."""
     plans = Plans(np.array([0.0, 1.0]), np.array([1.4, 1.4]), np.full(2, 0.9), np.zeros(2))
-    ahead = foresee(Way(ROUTE), plans, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2)))
+    ahead = foresee(
+        Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0), np.zeros((0, 2)), np.zeros((0, 2))
+    )
     for far_m, nearness in ((12.0, 0.0), (5.0, 0.5)):
         cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
         scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
-        assert car_nearness(scene, ahead)[0] == pytest.approx(nearness)
+        assert car_nearness(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
 
 
 @pytest.mark.engine

@@ -11,7 +11,8 @@ from shapely.geometry import box
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, People, RobotState
 from cosim.episode.ports import Privileged
-from cosim.policies.social_force import BODIES_M, DESIRED_MPS, RELAXATION_S, force, from_edge, from_people, seen
+from cosim.policies.social_force import DESIRED_MPS, RELAXATION_S, bodies_m, force, from_edge, from_people, seen
+from cosim.spec.robot import COURIER
 
 
 def walker(x_m: float, y_m: float, heading_rad: float, speed_mps: float) -> People:
@@ -34,8 +35,8 @@ def test_a_push_is_minus_the_slope_of_the_potential(d: tuple[float, float]) -> N
         (potential(person, at + h * axis, velocity) - potential(person, at - h * axis, velocity)) / (2 * h)
         for axis in (np.array([1.0, 0.0]), np.array([0.0, 1.0]))
     ]
-    here = person.xy[0] + at * (1.0 + BODIES_M / math.hypot(*at))
-    assert from_people(person, here, velocity)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
+    here = person.xy[0] + at * (1.0 + bodies_m(COURIER) / math.hypot(*at))
+    assert from_people(person, COURIER, here, velocity)[0] == pytest.approx(-np.array(slope), rel=1e-3, abs=1e-6)
 
 
 def test_what_happens_behind_hardly_counts_and_pushes_lean_to_the_right() -> None:
@@ -54,13 +55,18 @@ def scene(y_m: float, others: People = NOBODY) -> Privileged:
 
 def test_alone_it_is_pulled_along_its_route_and_pushed_off_edges() -> None:
     """On the middle the goal pulls with v0 / tau; near the left edge the push is to the right, beyond it stronger."""
-    assert force(scene(0.0), np.zeros(2))[0] == pytest.approx(DESIRED_MPS / RELAXATION_S, rel=1e-3)
-    near, beyond = from_edge(scene(1.3), np.array([5.0, 1.3])), from_edge(scene(1.6), np.array([5.0, 1.6]))
+    assert force(scene(0.0), COURIER, np.zeros(2))[0] == pytest.approx(DESIRED_MPS / RELAXATION_S, rel=1e-3)
+    near, beyond = (
+        from_edge(scene(1.3), COURIER, np.array([5.0, 1.3])),
+        from_edge(scene(1.6), COURIER, np.array([5.0, 1.6])),
+    )
     assert near[0] == pytest.approx(0.0, abs=1e-9) and near[1] < 0.0
     assert beyond[1] < near[1]
 
 
 def test_somebody_who_comes_from_ahead_on_the_left_pushes_back_and_to_the_right() -> None:
     """A walker 2 m ahead, 0.3 m left, coming closer."""
-    alone, met = (force(scene(0.0, people), np.zeros(2)) for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3)))
+    alone, met = (
+        force(scene(0.0, people), COURIER, np.zeros(2)) for people in (NOBODY, walker(7.0, 0.3, math.pi, 1.3))
+    )
     assert met[0] < alone[0] and met[1] < alone[1] - 0.1

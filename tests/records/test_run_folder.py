@@ -31,7 +31,8 @@ def scenario(name: str) -> Scenario:
 
 SUITE = Suite(name="s", version="1", scenarios=tuple(scenario(f"s-{i}") for i in range(3)))
 SPEC = RunSpec(
-    suite="s", suite_version="1", suite_hash=SUITE.content_hash, policy="p", policy_name="p", policy_version="1",
+    suite="s", robot="courier",
+    suite_version="1", suite_hash=SUITE.content_hash, policy="p", policy_name="p", policy_version="1",
     scenarios=tuple(s.id for s in SUITE.scenarios), versions={"numpy": "2"},
 )  # fmt: skip
 
@@ -39,7 +40,7 @@ SPEC = RunSpec(
 def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: float = 1.0) -> Record:
     measures: dict[str, float | None] = dict.fromkeys(METRICS, None) | {"success": success}
     return Record(
-        scenario=name, scenario_hash="h", suite="s", suite_hash=SUITE.content_hash, seed=0, policy="p",
+        scenario=name, scenario_hash="h", suite="s", suite_hash=SUITE.content_hash, seed=0, robot="courier", policy="p",
         policy_version="1", goal_protocol="none", renderer="none", versions={"numpy": "2"}, status=status,
         ended="goal", ticks=3, state_hash="abc", measures=measures, clock={"wall_s": wall_s},
     )  # type: ignore[arg-type]  # fmt: skip

@@ -51,7 +51,8 @@ def test_a_crossing_walker_is_measured_as_it_walked() -> None:
     y = 1.0 - 1.2 * TICK_S * np.arange(20)
     tracks = np.column_stack([ticks, np.zeros(20), np.zeros(20), np.full(20, 12.0), y])
     record = Record(
-        scenario="t", scenario_hash="", suite="t", suite_hash="", seed=0, policy="p", policy_version="1",
+        scenario="t", scenario_hash="", suite="t", suite_hash="", seed=0, robot="courier", policy="p",
+        policy_version="1",
         goal_protocol="", renderer="", versions={}, status="done",
     )  # fmt: skip
     (row,) = rows_of(scenario_of("lateral"), record, log_of(x_m, tracks))

@@ -19,6 +19,7 @@ from cosim.policies.replay import Replay
 from cosim.records.record import Recorder
 from cosim.report.hud import Layout
 from cosim.report.video import Video
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
 from physics.cameras.eyes import WorldCamera
 from scenarios.viewing.film import Cut, robot_eye
@@ -193,6 +194,6 @@ def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:
 def test_a_replay_ends_with_its_record() -> None:
     """Beyond the last recorded tick there is nothing to say."""
     replay = Replay(np.array([[1.0, 0.2]]))
-    assert replay.act(Observation(0, 0.0, None, 0.0, 0.0)).w_radps == 0.2
+    assert replay.act(Observation(0, 0.0, None, 0.0, 0.0, COURIER)).w_radps == 0.2
     with pytest.raises(RunError, match="ends after 1 ticks"):
-        replay.act(Observation(1, 0.05, None, 0.0, 0.0))
+        replay.act(Observation(1, 0.05, None, 0.0, 0.0, COURIER))

@@ -116,6 +116,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     manifest = driver.manifest
     spec = RunSpec(
         suite="s",
+        robot="courier",
         suite_version="1",
         suite_hash=short.content_hash,
         policy="orca",

@@ -103,8 +103,8 @@ def test_a_span_is_said_with_its_unit_once(low_s: float, high_s: float, words: s
 def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
     """The record of an episode that took 20 s, 4 of them to set up."""
     record = Record(
-        scenario=scenario.id, scenario_hash="", suite="s", suite_hash="", seed=0, policy="route", policy_version="1",
-        goal_protocol="route", renderer=GL, versions=versions(), status=status, ticks=1600,
+        scenario=scenario.id, scenario_hash="", suite="s", suite_hash="", seed=0, robot="courier", policy="route",
+        policy_version="1", goal_protocol="route", renderer=GL, versions=versions(), status=status, ticks=1600,
         clock={"wall_s": 20.0, "setup_s": 4.0},
     )  # fmt: skip
     folder.episode_folder(scenario.id).mkdir()
@@ -113,7 +113,8 @@ def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
 
 def run_of(path: Path) -> RunFolder:
     spec = RunSpec(
-        suite="s", suite_version="1", suite_hash="", policy="route", policy_name="route", policy_version="1",
+        suite="s", robot="courier",
+        suite_version="1", suite_hash="", policy="route", policy_name="route", policy_version="1",
         scenarios=tuple(s.id for s in LONG), versions=versions(), renderer=GL,
     )  # fmt: skip
     return RunFolder.create(path, spec, Suite(name="s", version="1", scenarios=LONG))

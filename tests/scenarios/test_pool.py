@@ -199,7 +199,8 @@ def pooled(folder: Path, *fakes: Fake, **named: float) -> Record:
         load_policy("stop"),
     )
     spec = RunSpec(
-        suite="s", suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
+        suite="s", robot="courier",
+        suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
         scenarios=("s-0",), versions={},
     )  # fmt: skip
     hello = Hello("stop", driver.manifest, driver.source_hash)

@@ -16,7 +16,6 @@ from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError
 from cosim.core.geometry import Polyline
 from cosim.core.state import NO_VEHICLES, NOBODY, RobotState, Street
-from cosim.episode.control import Limits
 from cosim.episode.driver import Driver
 from cosim.episode.loop import Moment, query
 from cosim.episode.ports import Privileged
@@ -24,6 +23,7 @@ from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, Walkabl
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.spec.events import Event, EventQuery
+from cosim.spec.robot import ROBOTS, Robot
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
 from scenarios.builders.build import Proof
@@ -274,20 +274,22 @@ def test_routes_keep_off_stairs_and_bridges() -> None:
     assert "every long sidewalk is a stair, a bridge, a tunnel or on a road (1 times)): import another area" in said
 
 
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
 @pytest.mark.parametrize("name", POLICIES)
-def test_every_policy_answers_within_its_manifest(name: str) -> None:
-    """Every shipped policy resets, acts and stays within the robot's limits on an empty street."""
+def test_every_policy_answers_within_its_manifest(name: str, robot: Robot) -> None:
+    """Every shipped policy resets, acts and stays within every robot's limits on an empty street."""
     from cosim.episode.ports import Observation
 
-    driver, limits = Driver(POLICIES[name]()), Limits()
+    driver = Driver(POLICIES[name]())
     Clock.for_rate(driver.manifest.rate_hz)
     route = Polyline([(0, 0), (50, 0)])
     driver.reset("t", 0)
     for tick in range(0, 200, 2):
-        robot = RobotState(route.at(tick * 0.05), 1.0)
-        known = Privileged(robot, route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2))
-        command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, known))
-        assert 0.0 <= command.v_mps <= limits.v_mps and abs(command.w_radps) <= limits.w_radps
+        known = Privileged(
+            RobotState(route.at(tick * 0.05), 1.0), route, tick * 0.05, NOBODY, NO_VEHICLES, {}, (), box(-1, -2, 51, 2)
+        )
+        command = driver.act(Observation(tick, tick * 0.05, None, 1.0, 0.0, robot, known))
+        assert 0.0 <= command.v_mps <= robot.v_max_mps and abs(command.w_radps) <= robot.w_max_radps
 
 
 def test_the_walking_graph_agrees_with_the_branches() -> None:

@@ -52,7 +52,7 @@ class GlCamera(WorldCamera):
         if self._context is None:
             world, shadows = self._world, self._light.shadows
             with context() as gl:
-                self._scene = GlScene(gl, world.surface, world.barriers, world.model, self._light)
+                self._scene = GlScene(gl, world.surface, world.barriers, world.robot, self._light)
                 self._shadows = ShadowMaps(gl) if shadows else None
                 self._block, self._sun_block = SceneBlock(gl), SceneBlock(gl)
                 self._backdrop = Backdrop(gl, self._sky)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, RobotState, Street, Vehicles
+from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.crowd import CrowdDrawing
@@ -27,7 +28,7 @@ from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.tiles import TileBuffers, tile_shaders
 from physics.cameras.gl.walls import WallBuffers, wall_shaders
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
-from physics.robots import RobotModel
+from physics.robots import urdf_of
 from physics.street import props, vehicles
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
@@ -72,12 +73,7 @@ class GlScene:
     """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
 
     def __init__(
-        self,
-        context: moderngl.Context,
-        surface: Surface,
-        barriers: Sequence[Barrier],
-        model: RobotModel,
-        light: Lighting,
+        self, context: moderngl.Context, surface: Surface, barriers: Sequence[Barrier], model: Robot, light: Lighting
     ) -> None:
         self._context, self._surface, self._model = context, surface, model
         self._tiles: dict[Key, _Tile] = {}
@@ -305,8 +301,8 @@ class GlScene:
 
     def _robot(self, robot: RobotState) -> _Placed:
         """The robot with its base frame at its pose, leaning with the ground."""
-        form = self._forms.id(("robot", self._model.name), partial(robot_parts, self._model.urdf))
-        _, roll, pitch = self._surface.lean(robot.pose, self._model)
+        form = self._forms.id(("robot", self._model.name), partial(robot_parts, urdf_of(self._model)))
+        _, roll, pitch = self._surface.lean(robot.pose, self._model.drive.span_m)
         rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
         rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
         rows["turn"] = p.getQuaternionFromEuler((roll, pitch, robot.pose.heading_rad))

@@ -1,0 +1,321 @@
+"""A third robot, larger and slower than the shipped ones, made here of a row and a URDF: everything follows it."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import LineString, box
+
+from cosim.core.errors import RunError, SpecError, UsageError
+from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, Signal, Street
+from cosim.episode.control import command_of
+from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies import POLICIES
+from cosim.policies.body import BodyDisks
+from cosim.policies.foresight import STEP_S, Plans, Way, foresee
+from cosim.policies.groups import lines
+from cosim.policies.orca import lane_past
+from cosim.policies.route import best_lane, crossing_limit
+from cosim.policies.social_force import bodies_m
+from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.spec import robot as table
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid
+from cosim.spec.scenario import Suite, content_hash
+from physics.cameras.view import robot_shot
+from physics.robots import urdf_of
+from physics.world.drive import SkidDrive
+from physics.world.street_surface import StreetSurface
+from scenarios.builders.barriers import fenced
+from scenarios.builders.fits import misfits
+from scenarios.catalog import load_suite, with_robot
+from scenarios.checks import small_scenario
+from scenarios.execution.places import place
+from tests.conftest import Cosim
+from tests.spec.test_fits import barrier, crossroads, from_west_to_east
+from tests.tiny_street import tiny_map
+
+BARROW = Robot(
+    name="barrow",
+    urdf="barrow.urdf",
+    length_m=1.0,
+    width_m=0.8,
+    height_m=0.6,
+    com_height_m=0.25,
+    drive=Skid(0.15, (0.6, 0.66), 15.0, left=("fl", "rl"), right=("fr", "rr")),
+    mounts={"front": Mount((0.45, 0.0, 0.9), 5.0), "mast": Mount((0.0, 0.0, 1.4), 20.0)},
+    cruise_mps=0.8,
+    v_max_mps=1.0,
+    w_max_radps=0.4,
+    acceleration_mps2=1.0,
+    acceleration_radps2=1.5,
+)
+WHEEL = """
+  <link name="{name}_wheel">
+    <inertial><mass value="2"/><inertia ixx="0.013" iyy="0.0225" izz="0.013" ixy="0" ixz="0" iyz="0"/></inertial>
+    <collision><origin rpy="1.5707963 0 0"/><geometry><cylinder radius="0.15" length="0.1"/></geometry></collision>
+  </link>
+  <joint name="{name}" type="continuous">
+    <parent link="base"/><child link="{name}_wheel"/><origin xyz="{x} {y} 0.15"/><axis xyz="0 1 0"/>
+  </joint>"""
+URDF = """<robot name="barrow">
+  <link name="base">
+    <inertial><origin xyz="0 0 0.25"/><mass value="52"/>
+      <inertia ixx="3.4" iyy="5.0" izz="6.9" ixy="0" ixz="0" iyz="0"/></inertial>
+    <visual><origin xyz="0 0 0.46"/><geometry><box size="1.0 0.8 0.28"/></geometry></visual>
+    <collision><origin xyz="0 0 0.46"/><geometry><box size="1.0 0.8 0.28"/></geometry></collision>
+  </link>{wheels}
+</robot>"""
+
+
+@pytest.fixture
+def barrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
+    """The third robot: a row in the table, and its URDF. Nothing else is told of it."""
+    spots = {"fl": (0.3, 0.33), "rl": (-0.3, 0.33), "fr": (0.3, -0.33), "rr": (-0.3, -0.33)}
+    wheels = "".join(WHEEL.format(name=name, x=x, y=y) for name, (x, y) in spots.items())
+    (tmp_path / "barrow.urdf").write_text(URDF.format(wheels=wheels))
+    row = dataclasses.replace(BARROW, urdf=str(tmp_path / "barrow.urdf"))
+    monkeypatch.setitem(table.ROBOTS, "barrow", row)  # type: ignore[arg-type]
+    return row
+
+
+EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOTS, "barrow"])
+
+
+def seen(robot: Robot, others: People = NOBODY, heading_rad: float = 0.0, v_mps: float = 0.0) -> Observation:
+    """A robot on a straight route along the x axis; the walkway is free 1.7 m to either side."""
+    state = RobotState(Pose(5.0, 0.0, heading_rad), v_mps)
+    free = box(-2.0, -1.7, 60.0, 1.7)
+    known = Privileged(state, Polyline([(0.0, 0.0), (50.0, 0.0)]), 5.0, others, NO_VEHICLES, {}, (), free)
+    return Observation(0, 0.0, None, v_mps, 0.0, robot, known)
+
+
+def standing(x_m: float, y_m: float) -> People:
+    return People.of(("c0",), [(x_m, y_m)], [0.0], [0.0], ("stand",))
+
+
+@EVERY
+def test_the_disks_that_policies_plan_with_hold_the_robot(robot: Robot) -> None:
+    """Every point of its outline lies in the two disks of its body and in the one around it, and these are tight."""
+    disks, (half_m, aside_m) = BodyDisks.of(robot), (robot.length_m / 2, robot.width_m / 2)
+    edge = np.array(shapely.box(-half_m, -aside_m, half_m, aside_m).segmentize(0.01).exterior.coords)
+    away = np.abs(np.abs(edge) - (disks.nose_m, 0.0))
+    assert np.hypot(*away.T).max() <= disks.radius_m < np.hypot(half_m / 2, aside_m) + 0.02
+    assert np.hypot(*edge.T).max() <= disks.around_m < math.hypot(half_m, aside_m) + 0.02
+
+
+@EVERY
+def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -> None:
+    """Alone on a straight way each takes up its share of the pace; off its way it turns as fast as the robot can."""
+    paces = {"route": 1.0, "orca": 28 / 30, "straight": 4 / 5, "social_force": min(1.0, 1.34 / robot.cruise_mps)}
+    for name, share in paces.items():
+        policy = POLICIES[name]()
+        policy.reset("t", 0)
+        command = command_of(policy.act(seen(robot)), waypoint_dt_s=0.25, robot=robot)
+        assert command.v_mps == pytest.approx(share * robot.cruise_mps, rel=1e-3), name
+        policy.reset("t", 0)
+        turned = policy.act(seen(robot, heading_rad=-1.0))
+        assert isinstance(turned, Command) and (name == "straight" or turned.w_radps == robot.w_max_radps), name
+
+
+@EVERY
+def test_foresight_knows_ramps_and_turning_rate(robot: Robot) -> None:
+    """What is foreseen of a plan turns and speeds up no faster than the robot does."""
+    plans = Plans(np.array([1.5]), np.array([robot.cruise_mps]), np.array([0.9]), np.array([0.0]))
+    way, empty = Way(Polyline([(0.0, 0.0), (50.0, 0.0)])), np.zeros((0, 2))
+    ahead = foresee(way, plans, robot, Pose(5.0, 0.0, -0.8), 5.0, (0.0, 0.0), empty, empty)
+    turns = np.abs(np.diff(np.append(-0.8, ahead.pose[:, 0, 2]))) / STEP_S
+    speeds = np.hypot(*np.diff(np.vstack([[5.0, 0.0], ahead.pose[:, 0, :2]]), axis=0).T) / STEP_S
+    assert turns.max() == pytest.approx(robot.w_max_radps)
+    assert np.diff(np.append(0.0, speeds)).max() <= robot.acceleration_mps2 * STEP_S
+
+
+def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earlier() -> None:
+    """Past somebody beside the way, before a person, before a crossing at red."""
+    for small, large in itertools.pairwise((SCOUT, COURIER, BARROW)):
+        beside = standing(8.0, 0.62 + BodyDisks.of(small).radius_m)
+        known = seen(small, beside).privileged
+        assert known is not None
+        way, ends = Way(known.route), lines(beside)
+        lanes = [lane_past(known, BodyDisks.of(one), way, known.free, ends, 0.0) for one in (small, large)]
+        assert lanes[1] < lanes[0] == 0.0
+        offsets = [best_lane(known, one, 0.0, patient=True)[0] for one in (small, large)]
+        assert offsets[1] < offsets[0] == 0.0
+        assert bodies_m(large) - bodies_m(small) == pytest.approx((large.length_m - small.length_m) / 2)
+        red = dataclasses.replace(known, crossings=(("c", 7.0, 12.0),), signals={"c": Signal(False, 30.0)})
+        assert crossing_limit(red, large) < crossing_limit(red, small)
+
+
+def test_answers_are_clipped_to_the_robot_that_drives() -> None:
+    """A command and a waypoint beyond what the third robot can."""
+    for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]])):
+        assert command_of(answer, waypoint_dt_s=0.25, robot=BARROW) == Command(1.0, -0.4)
+
+
+@EVERY
+def test_motors_ramp_as_the_row_says(robot: Robot) -> None:
+    """Wheels reach a speed after as long as the acceleration takes, and every joint is told one."""
+    drive, dt_s = SkidDrive(robot), 0.005
+    for k in range(1, 40):
+        speeds = drive.joint_speeds(Command(robot.v_max_mps, 0.0), 0.0, dt_s)
+        assert speeds == pytest.approx([k * dt_s * robot.acceleration_mps2 / robot.drive.wheel_radius_m] * 4)
+
+
+def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
+    """The same policy sees from another height on each robot; a mount may be named, or be a place on any robot."""
+    surface, state = StreetSurface(tiny_map(), 1), RobotState(Pose(-40.0, 100.0, 0.0))
+    for robot in (COURIER, SCOUT, barrow):
+        eye_m = robot_shot(surface, robot, CameraSpec(), state).eye_m - (-40.0, 100.0, 0.0)
+        assert eye_m == pytest.approx(robot.mounts["front"].at_m)
+    assert CameraSpec(mount="mast").on(barrow) == Mount((0.0, 0.0, 1.4), 20.0)
+    own = Mount((0.1, 0.0, 0.3), 5.0)
+    assert CameraSpec(mount=own).on(barrow) == CameraSpec(mount=own).on(SCOUT) == own
+    with pytest.raises(UsageError, match="unknown camera mount of robot 'scout' 'mast'"):
+        CameraSpec(mount="mast").on(SCOUT)
+
+
+def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> None:
+    """0.35 m beside the route: the courier passes, the third robot does not."""
+    fence = barrier(x_m=-20.0, y_m=1.0, heading_rad=0.0, length_m=1.3, strip="west", end=0)
+    fine = from_west_to_east(barriers=(fence,))
+    assert list(misfits([fine], crossroads())) == []
+    assert list(misfits([fine.driven_by(barrow.name)], crossroads())) == [
+        "scenario 's': barriers[0] on strip 'west' stands across the route"
+    ]
+
+
+def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
+    """Version and hashes tell; the suite's own robot changes nothing; a run is not resumed with another robot."""
+    shipped = load_suite("long-horizon")
+    whole = with_robot(shipped, "scout")
+    assert (whole.version, {s.robot for s in whole.scenarios}) == (f"{shipped.version}-scout", {"scout"})
+    assert whole.content_hash != shipped.content_hash
+    assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
+    assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
+    spec = RunSpec(
+        suite="s", robot="courier", suite_version="1", suite_hash="h", policy="p", policy_name="p", policy_version="1",
+        scenarios=(), versions={},
+    )  # fmt: skip
+    with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
+        pass
+    with pytest.raises(RunError, match="its robot is courier, now asked for is scout"):
+        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(spec, robot="scout", suite_hash="other"))
+
+
+def test_a_robot_that_is_not_there_is_refused_with_those_that_are(cosim: Cosim, tmp_path: Path) -> None:
+    """By `run` and `look`, before anything is read or written; `list` names them."""
+    for words in (("run", "reactive", "--out", "run"), ("look", "lh-011-00")):
+        said = cosim(*words, "--robot", "tank", cwd=tmp_path)
+        assert said.returncode == 2 and "unknown robot 'tank'. Valid choices: courier, scout." in said.stderr
+    assert not list(tmp_path.iterdir())
+    assert "robot   scout  0.50 x 0.40 m, travels at 2 m/s" in cosim("list").stdout
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
+def test_a_urdf_is_as_its_row_says(name: str, barrow: Robot) -> None:
+    """Its collision body fills the outline, its wheels stand where they should, its mass is where it should be."""
+    from physics.world.bullet import p
+
+    robot = table.robot_called(name)
+    client = p.connect(p.DIRECT)
+    try:
+        body = p.loadURDF(str(urdf_of(robot)), flags=p.URDF_USE_INERTIA_FROM_FILE, physicsClientId=client)
+        infos = [p.getJointInfo(body, j, client) for j in range(p.getNumJoints(body, client))]
+        (x, y, z), _ = p.getBasePositionAndOrientation(body, client)
+        bounds = np.array([p.getAABB(body, link, client) for link in range(-1, len(infos))])
+        at = [p.getLinkState(body, info[0], physicsClientId=client)[4] for info in infos]
+    finally:
+        p.disconnect(client)
+    wheels = {info[1].decode(): np.array(spot) for info, spot in zip(infos, at, strict=True)}
+    low, high = bounds[:, 0].min(axis=0), bounds[:, 1].max(axis=0)
+    assert (x, y, z) == pytest.approx((0.0, 0.0, robot.com_height_m))
+    half = (robot.length_m / 2, robot.width_m / 2)
+    assert high == pytest.approx([*half, robot.height_m], abs=0.01) and low == pytest.approx(
+        [-half[0], -half[1], 0.0], abs=0.01
+    )
+    ahead, aside = (0.5 * span for span in robot.drive.span_m)
+    radius = robot.drive.wheel_radius_m
+    for side, joints in ((aside, robot.drive.left), (-aside, robot.drive.right)):
+        for along, joint in zip((ahead, -ahead), joints, strict=True):
+            assert wheels[joint] == pytest.approx([along, side, radius], abs=1e-6)
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", [*ROBOTS, "barrow"])
+def test_every_robot_reaches_its_limits_upright(name: str, barrow: Robot) -> None:
+    """At its pace, at its highest speed in a curve, and turning on the spot: within 5 % of the command."""
+    from physics.world.world import BulletWorld
+
+    robot = table.robot_called(name)
+    empty = Street(0)
+    with BulletWorld(StreetSurface(tiny_map(), 1), robot=robot) as world:
+        for v_mps, w_radps in ((robot.cruise_mps, 0.0), (robot.v_max_mps, robot.w_max_radps), (0.0, robot.w_max_radps)):
+            world.place(Pose(-40.0, 100.0, 0.0))
+            states = [world.step(Command(v_mps, w_radps), empty, empty, 10).robot for _ in range(70)][40:]
+            assert np.mean([s.v_mps for s in states]) == pytest.approx(v_mps, rel=0.05, abs=0.02)
+            assert np.mean([s.w_radps for s in states]) == pytest.approx(w_radps, rel=0.05, abs=0.01)
+            assert max(s.tilt_rad for s in states) < 0.03
+
+
+@pytest.mark.engine
+def test_a_third_robot_runs_an_episode_and_everything_follows_it(barrow: Robot) -> None:
+    """Two seconds in a small city, by an option: what engines, referee and policy know of the robot is the row."""
+    import libsumo
+
+    from scenarios.execution.episode import Episode
+
+    scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
+    manifest, stages = Manifest("mine", rate_hz=10.0, camera=None, privileged=True), []
+    options = EpisodeOptions(robot="barrow")
+    policy = POLICIES["route"]()
+    with Episode(scenario, manifest, options, through=stages.append) as episode:
+        observation = episode.reset()
+        assert observation.robot is barrow and episode.footprint_m == (1.0, 0.8)
+        assert libsumo.vehicletype.getLength("robot") == pytest.approx(1.3)
+        assert libsumo.vehicletype.getWidth("robot") == pytest.approx(1.25)
+        known = observation.privileged
+        assert known is not None
+        _, street_map = place(scenario.place)
+        near = shapely.buffer(LineString(scenario.route), 5.0)
+        walkable, free = street_map.walkable_near(shapely.buffer(near, 5.0)), shapely.intersection(known.free, near)
+        assert walkable.covers(shapely.buffer(free, 0.39)) and not walkable.covers(shapely.buffer(free, 0.45))
+        while not episode.over:
+            observation = episode.advance(policy.act(observation))
+        record, log = episode.result()
+    assert (record.robot, record.scenario_hash) == ("barrow", content_hash(scenario.driven_by("barrow")))
+    v_mps = log.speed[:, 0]
+    assert np.diff(v_mps[5:]).max() < 1.1 * barrow.acceleration_mps2 * log.tick_s
+    assert 0.7 < v_mps.max() < 1.1 * barrow.cruise_mps
+    assert log.command.max(axis=0)[0] <= barrow.cruise_mps
+
+
+@pytest.mark.engine
+def test_the_one_way_is_proved_for_the_robot_that_shall_drive_it(
+    barrow: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A way built for the third robot is wide enough for it; for one as wide as the sidewalks there is none."""
+    from scenarios.builders import long_horizon
+
+    where = small_scenario().place
+    _, street_map = place(where)
+    graph = WalkGraph(street_map)
+    built = long_horizon.build_long_horizon(where, street_map, graph, 0, "wide", barrow)
+    assert built.robot == "barrow"
+    route = LineString(built.route)
+    open_to_all = fenced(street_map.walkable_near(shapely.buffer(route, 20.0)), built.barriers)
+    assert shapely.buffer(open_to_all, -barrow.width_m / 2).covers(route)
+    monkeypatch.setattr(long_horizon, "TRIES", 20)
+    monkeypatch.setattr(long_horizon, "SEARCHES", 0)
+    huge = dataclasses.replace(barrow, width_m=4.5)
+    with pytest.raises(SpecError, match=r"narrower than|comes nearer than"):
+        long_horizon.build_long_horizon(where, street_map, graph, 0, "huge", huge)
