@@ -11,6 +11,7 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
+from cosim.core.baked import cache_folder
 from cosim.core.errors import EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.place.walk_graph import WalkGraph
@@ -23,7 +24,6 @@ from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.execution.directing import directed
 from scenarios.execution.episode import Episode
 from scenarios.execution.places import place
-from sumo_nets.city.store import cache_folder
 
 _SMALL = City(seed=1, size_m=500.0)
 OWN = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")

@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.baked import Arrays, baked
 from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS
 from physics.people.families import FAMILIES, Family, skeleton
@@ -22,6 +24,7 @@ from physics.people.skeleton import Skeleton, forward, model_pose, skinning
 
 STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType({"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34})
 """How far the back is bent."""
+_SOURCES: Final = (Path(__file__).parent, Path(__file__).parents[2] / "cosim/people")
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,11 +47,13 @@ class Clips:
 @lru_cache(maxsize=1)
 def own_clips() -> Clips:
     """The motions of our own bodies."""
-    return _baked([(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES])
+    arrays = baked("clips", _SOURCES, _made)
+    return Clips(arrays["matrices"], arrays["gaits"], {name: arrays[name] for name in GESTURES})
 
 
-def _baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
-    """Every gait and gesture of bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
+def _made() -> Arrays:
+    """Every gait and gesture of our bodies: skeleton, stoop, and the (24, 3, 3) turns in which each is modelled."""
+    bodies = [(skeleton(family), STOOP_RAD[family], model_pose()) for family in FAMILIES]
     rows: list[NDArray[np.float32]] = []
     walking = np.zeros((len(bodies), len(PACES_MPS)), dtype=np.intp)
     standing = {name: np.zeros(len(bodies), dtype=np.intp) for name in GESTURES}
@@ -63,9 +68,7 @@ def _baked(bodies: list[tuple[Skeleton, float, Floats]]) -> Clips:
             first[k] = at
             rows.append(skinning(*forward(*gesture(name, body, stoop_rad), body), bind))
             at += len(rows[-1])
-    matrices = np.concatenate(rows)
-    matrices.flags.writeable = False
-    return Clips(matrices, walking, MappingProxyType(standing))
+    return {"matrices": np.concatenate(rows), "gaits": walking, **standing}
 
 
 def bind_of(body: Skeleton, modelled: Floats) -> tuple[Floats, Floats]:

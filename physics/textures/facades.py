@@ -26,7 +26,7 @@ def facade_layers(size_px: int = 256, seed: int = 0) -> Layers:
         for name, style in styles.items()
         for k in range(BAY_VARIANTS)
     }
-    return stacked(recipes, size_px, seed)
+    return stacked("facades", recipes, size_px, seed)
 
 
 def _drawn(style: Callable[[FacadeCanvas], None], number: int) -> Callable[[Noise], Picture]:

@@ -26,7 +26,7 @@ _DARK: Final = (0.36, 0.35, 0.34)
 @lru_cache(maxsize=4)
 def ground_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Every layer of ground. size_px: 256 suits a laptop."""
-    return stacked(GROUND_RECIPES, size_px, seed)
+    return stacked("ground", GROUND_RECIPES, size_px, seed)
 
 
 def _asphalt(stone: float, tone: float = 0.33, worn: float = 0.0, patches: bool = False) -> Generator:

@@ -13,12 +13,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.baked import Arrays, baked
 from cosim.core.errors import SpecError, UsageError, unknown
 from physics.textures.noise import Field, Noise
 
@@ -74,27 +76,34 @@ class Recipe:
     make: Generator
 
 
-def stacked(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
-    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one changes no other."""
+def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Layers:
+    """Every recipe's layer, in the table's order. Each has its own generator, so that a new one changes no other.
+
+    kind: what they are, a word in the name under which they are kept (`cosim.core.baked`).
+    """
     if size_px not in SIZES:
         raise SpecError(f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}")
-    rgba = np.empty((len(recipes), size_px, size_px, 4), np.uint8)
-    mean = np.empty((len(recipes), 3), np.float32)
-    finish = None
+    arrays = baked(f"{kind}-{size_px}-{seed}", (Path(__file__).parent,), lambda: _made(recipes, size_px, seed))
+    metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
+    metres.flags.writeable = False
+    return Layers(tuple(recipes), arrays["rgba"], metres, arrays["mean"], arrays.get("finish"))
+
+
+def _made(recipes: Mapping[str, Recipe], size_px: int, seed: int) -> Arrays:
+    made: dict[str, NDArray[Any]] = {
+        "rgba": np.empty((len(recipes), size_px, size_px, 4), np.uint8),
+        "mean": np.empty((len(recipes), 3), np.float32),
+    }
     for k, (name, recipe) in enumerate(recipes.items()):
         picture = recipe.make(Noise(size_px, (seed, *name.encode())))
         rgb = quantised(picture.rgb)
-        rgba[k, ..., :3] = rgb
-        rgba[k, ..., 3] = 255 if picture.alpha is None else quantised(picture.alpha)
-        mean[k] = mean_linear(rgb)
+        made["rgba"][k, ..., :3] = rgb
+        made["rgba"][k, ..., 3] = 255 if picture.alpha is None else quantised(picture.alpha)
+        made["mean"][k] = mean_linear(rgb)
         if picture.finish is not None:
-            finish = np.zeros((len(recipes), size_px, size_px, 2), np.uint8) if finish is None else finish
-            finish[k] = quantised(picture.finish)
-    metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
-    for array in (rgba, metres, mean, finish):
-        if array is not None:
-            array.flags.writeable = False
-    return Layers(tuple(recipes), rgba, metres, mean, finish)
+            made.setdefault("finish", np.zeros((len(recipes), size_px, size_px, 2), np.uint8))
+            made["finish"][k] = quantised(picture.finish)
+    return made
 
 
 def joined_layers(*stacks: Layers) -> Layers:

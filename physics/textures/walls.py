@@ -23,13 +23,13 @@ _STRETCHER, _HEADER = 0.225, 0.1125
 @lru_cache(maxsize=4)
 def wall_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Every layer of walls and roofs, and of glass."""
-    return stacked(WALLS, size_px, seed)
+    return stacked("walls", WALLS, size_px, seed)
 
 
 @lru_cache(maxsize=4)
 def prop_layers(size_px: int = 512, seed: int = 0) -> Layers:
     """Every layer for trees and street furniture: bark, foliage, planks, metal, stone."""
-    return stacked(PROPS, size_px, seed)
+    return stacked("props", PROPS, size_px, seed)
 
 
 def _plaster(rough: float, dirt: float, crazed: float = 0.0) -> Generator:

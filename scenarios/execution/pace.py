@@ -19,13 +19,13 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
+from cosim.core.baked import cache_folder
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
 from cosim.core.telling import duration
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from sumo_nets.city.store import cache_folder
 
 FILE: Final = "pace.jsonl"
 EPISODES_KEPT: Final = 500

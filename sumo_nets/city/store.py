@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import tempfile
 from collections.abc import Sequence
 from importlib.metadata import version
@@ -11,8 +10,8 @@ from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import msgspec
-from platformdirs import user_cache_path
 
+from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, unwritable
 from cosim.spec.scenario import City
 from sumo_nets.city.blocks import CLASSES, Point
@@ -39,11 +38,6 @@ NETCONVERT = (
     f"--default.crossing-width={CROSSING_M}",
     "--default.sidewalk-width=3.2",
 )
-
-
-def cache_folder() -> Path:
-    """Where built nets are kept: $COSIM_CACHE, else the user's cache folder (~/.cache/sidewalk-cosim)."""
-    return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
 def city_net(city: City) -> Path:

@@ -13,11 +13,11 @@ from pathlib import Path
 
 import msgspec
 
+from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
 from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
-from sumo_nets.city.store import cache_folder
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
 from sumo_nets.maps.importer import Options, convert
 from sumo_nets.maps.rawfile import head_of

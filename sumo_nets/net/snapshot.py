@@ -26,8 +26,8 @@ from shapely.geometry import MultiPolygon, Polygon
 
 import cosim
 import sumo_nets
+from cosim.core.baked import cache_folder
 from cosim.place.street_map import StreetMap
-from sumo_nets.city.store import cache_folder
 from sumo_nets.net.netfile import read_net
 
 SNAPSHOT_FOLDER: Final = "read"

@@ -15,12 +15,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, UsageError
 from cosim.place.route_line import through_corner
 from cosim.place.street_map import Port
 from cosim.spec.scenario import City, CityMap
 from sumo_nets.city.store import build_city
-from sumo_nets.maps import importer, mapstore
+from sumo_nets.maps import importer
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.importer import Options
@@ -75,7 +76,7 @@ def written(path: Path, text: str) -> Path:
 @cache
 def small_city() -> bytes:
     """The net of a city of 300 m."""
-    path = mapstore.cache_folder() / "small.net.xml"
+    path = cache_folder() / "small.net.xml"
     build_city(City(seed=3, size_m=300.0), path)
     return path.read_bytes()
 

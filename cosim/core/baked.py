@@ -1,0 +1,118 @@
+"""Arrays that take long to make, kept: made once on a machine, then mapped into memory and shared by its processes.
+
+They lie in the cache folder under a name that says what they depend on: the source that makes them and the libraries
+it stands on. What is damaged is made anew; a cache that cannot be written is done without, and that is said.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+from platformdirs import user_cache_path
+
+Arrays = Mapping[str, NDArray[Any]]
+
+_FOLDER: Final = "baked"
+_SEAL: Final = "seal.json"
+_LEFT_OVER_S: Final = 3600.0
+"""A folder in the making that is older than this belongs to a process that was killed."""
+_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet")
+"""Packages that what is baked depends on."""
+
+
+def cache_folder() -> Path:
+    """Where what was made is kept: $COSIM_CACHE, else the user's cache folder (~/.cache/sidewalk-cosim)."""
+    return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
+
+
+def baked(name: str, rooms: tuple[Path, ...], make: Callable[[], Arrays]) -> Arrays:
+    """What `make` makes, write-protected: from the cache, else made now and kept.
+
+    name: of the file name, with everything `make` was told; rooms: the folders of the sources it is made by.
+    """
+    folder = cache_folder() / _FOLDER / f"{name}-{_made_by(rooms)}"
+    with suppress(OSError, ValueError, msgspec.DecodeError):
+        return _read(folder)
+    arrays = {key: np.ascontiguousarray(array) for key, array in make().items()}
+    try:
+        _keep(folder, arrays)
+        return _read(folder)
+    except (OSError, ValueError, msgspec.DecodeError) as error:
+        _say_once(f"note: {folder.parent}: not kept for the next process, which makes it anew: {error}")
+    for array in arrays.values():
+        array.flags.writeable = False
+    return arrays
+
+
+def _read(folder: Path) -> Arrays:
+    """Raises OSError where there is nothing, ValueError where it is not what was kept."""
+    seals = msgspec.json.decode((folder / _SEAL).read_bytes(), type=dict[str, str])
+    arrays: dict[str, NDArray[Any]] = {}
+    for key, seal in seals.items():
+        with (folder / f"{key}.npy").open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() != seal:
+                raise ValueError(f"{folder / key}.npy: not what was written")
+        arrays[key] = np.load(folder / f"{key}.npy", mmap_mode="r", allow_pickle=False)
+    return arrays
+
+
+def _keep(folder: Path, arrays: Arrays) -> None:
+    """In one move: several processes may make the same at once, and the first wins."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    _clear(folder.parent)
+    making = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
+    try:
+        seals = {}
+        for key, array in arrays.items():
+            np.save(making / f"{key}.npy", array, allow_pickle=False)
+            with (making / f"{key}.npy").open("rb") as file:
+                seals[key] = hashlib.file_digest(file, "sha256").hexdigest()
+        (making / _SEAL).write_bytes(msgspec.json.encode(seals))
+        making.chmod(0o755)
+        try:
+            making.rename(folder)
+        except OSError:  # somebody was faster, or what is there is damaged
+            with suppress(OSError, ValueError, msgspec.DecodeError):
+                _read(folder)
+                return
+            shutil.rmtree(folder)
+            making.rename(folder)
+    finally:
+        shutil.rmtree(making, ignore_errors=True)
+
+
+def _clear(parent: Path) -> None:
+    """Take away what processes that were killed left half made."""
+    for left in parent.glob(".making-*"):
+        with suppress(OSError):
+            if time.time() - left.stat().st_mtime > _LEFT_OVER_S:
+                shutil.rmtree(left, ignore_errors=True)
+
+
+@cache
+def _made_by(rooms: tuple[Path, ...]) -> str:
+    """16 hex digits of the sources in some folders and of the libraries."""
+    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
+    for room in rooms:
+        for source in sorted(room.rglob("*.py")):
+            seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
+    return seen.hexdigest()[:16]
+
+
+@cache
+def _say_once(words: str) -> None:
+    print(words, file=sys.stderr, flush=True)

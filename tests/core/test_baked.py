@@ -1,0 +1,114 @@
+"""Arrays that are kept: made once, never wrong, and done without where they cannot be kept."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.core import baked as module
+from cosim.core.baked import Arrays, baked
+from tests.conftest import PATIENCE_S
+
+WANTED = {"ramp": np.arange(1000.0).reshape(10, 100), "bytes": np.arange(256, dtype=np.uint8)}
+
+
+class Maker:
+    """Counts how often it is asked."""
+
+    def __init__(self) -> None:
+        self.times = 0
+
+    def __call__(self) -> Arrays:
+        self.times += 1
+        return WANTED
+
+
+@pytest.fixture
+def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of sources, and a cache of its own."""
+    monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
+    module._made_by.cache_clear()
+    module._say_once.cache_clear()
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "maker.py").write_text("version = 1\n")
+    return tmp_path / "room"
+
+
+def same(arrays: Arrays) -> bool:
+    return arrays.keys() == WANTED.keys() and all((arrays[key] == WANTED[key]).all() for key in WANTED)
+
+
+def test_what_was_made_is_made_once_and_mapped_into_memory(room: Path) -> None:
+    """The second asking gives the same arrays out of the file, write-protected."""
+    make = Maker()
+    assert same(baked("a", (room,), make)) and same(again := baked("a", (room,), make)) and make.times == 1
+    assert all(isinstance(array, np.memmap) and not array.flags.writeable for array in again.values())
+
+
+def test_other_sources_and_other_names_make_anew(room: Path) -> None:
+    """What is kept of another source, or under another name, is not taken."""
+    make = Maker()
+    baked("a", (room,), make)
+    baked("b", (room,), make)
+    (room / "maker.py").write_text("version = 2\n")
+    module._made_by.cache_clear()
+    baked("a", (room,), make)
+    assert make.times == 3
+
+
+@pytest.mark.parametrize("damage", ["a bit", "cut off", "no seal", "no array", "not JSON"])
+def test_damage_is_made_anew(room: Path, tmp_path: Path, damage: str) -> None:
+    """Whatever became of the files, the arrays are right, and whole again afterwards."""
+    make = Maker()
+    baked("a", (room,), make)
+    (folder,) = (tmp_path / "cache/baked").iterdir()
+    array, seal = folder / "ramp.npy", folder / "seal.json"
+    held = array.read_bytes()
+    match damage:
+        case "a bit":
+            array.write_bytes(held[:-1] + bytes([held[-1] ^ 1]))
+        case "cut off":
+            array.write_bytes(held[: len(held) // 2])
+        case "no seal":
+            seal.unlink()
+        case "no array":
+            array.unlink()
+        case "not JSON":
+            seal.write_bytes(b"{")
+    assert same(baked("a", (room,), make)) and same(baked("a", (room,), make)) and make.times == 2
+
+
+def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
+    room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The arrays are right all the same; one line tells why the next process makes them anew."""
+    (tmp_path / "cache").write_text("a file where a folder should be")
+    make = Maker()
+    assert same(baked("a", (room,), make)) and same(baked("a", (room,), make)) and make.times == 2
+    told = capsys.readouterr().err
+    assert told.startswith("note: ") and "not kept" in told and len(told.splitlines()) == 1
+
+
+def test_who_makes_it_at_once_gets_the_same_and_leaves_nothing(room: Path, tmp_path: Path) -> None:
+    """Processes that make the same at the same time all get it, also beside what a killed one left half made."""
+    left = tmp_path / "cache/baked/.making-of-a-killed-one"
+    left.mkdir(parents=True)
+    (left / "ramp.npy").write_bytes(b"half")
+    code = (
+        "import sys, pathlib, numpy as np\nfrom cosim.core.baked import baked\nsys.stdin.readline()\n"
+        "print(int(baked('a', (pathlib.Path(sys.argv[1]),), lambda: {'n': np.arange(200000)})['n'].sum()))"
+    )
+    makers = [
+        subprocess.Popen([sys.executable, "-c", code, str(room)], stdin=-1, stdout=-1, text=True) for _ in range(4)
+    ]
+    for maker in makers:
+        assert maker.stdin is not None
+        maker.stdin.write("\n")
+        maker.stdin.flush()
+    assert {maker.communicate(timeout=PATIENCE_S)[0] for maker in makers} == {f"{sum(range(200000))}\n"}
+    (kept,) = (path for path in (tmp_path / "cache/baked").iterdir() if path != left)
+    assert kept.name.startswith("a-")
