@@ -7,6 +7,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
@@ -161,30 +162,8 @@ def _quaternions(turns: Floats) -> Floats:
     z = np.cross(x, turns[..., 1])
     z /= np.linalg.norm(z, axis=-1, keepdims=True)
     y = np.cross(z, x)
-    w2 = np.stack(
-        [
-            1.0 + x[..., 0] - y[..., 1] - z[..., 2],
-            1.0 - x[..., 0] + y[..., 1] - z[..., 2],
-            1.0 - x[..., 0] - y[..., 1] + z[..., 2],
-            1.0 + x[..., 0] + y[..., 1] + z[..., 2],
-        ],
-        axis=-1,
-    )
-    size = np.sqrt(np.maximum(w2, 0.0))
-    xy, xz, yz = x[..., 1] + y[..., 0], x[..., 2] + z[..., 0], y[..., 2] + z[..., 1]
-    wx, wy, wz = y[..., 2] - z[..., 1], z[..., 0] - x[..., 2], x[..., 1] - y[..., 0]
-    largest = np.argmax(w2, axis=-1)
-    rows = np.stack(
-        [
-            np.stack([w2[..., 0], xy, xz, wx], -1),
-            np.stack([xy, w2[..., 1], yz, wy], -1),
-            np.stack([xz, yz, w2[..., 2], wz], -1),
-            np.stack([wx, wy, wz, w2[..., 3]], -1),
-        ],
-        axis=-2,
-    )
-    row = np.take_along_axis(rows, largest[..., None, None], axis=-2)[..., 0, :]
-    return np.asarray(row / (2.0 * np.take_along_axis(size, largest[..., None], axis=-1)))
+    turned = Rotation.from_matrix(np.stack([x, y, z], axis=-1).reshape(-1, 3, 3))
+    return np.asarray(turned.as_quat().reshape(*turns.shape[:-2], 4))
 
 
 def _off(point: Floats, ahead_m: float, up_m: float) -> Floats:

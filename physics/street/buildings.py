@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import Lane, PieceKind, StreetMap, Strip
 from cosim.place.terrain import Terrain
-from physics.world.mesh import Mesh, box, join, quads
+from physics.world.mesh import Mesh, box, join, plan_triangles, quads
 from physics.world.tiles import CURB_M, Key, key_at, square
 
 _MARGIN_M: Final = 0.2
@@ -198,11 +198,7 @@ def _outlined(building: Building, outline: shapely.Polygon) -> Mesh:
     ground, roof_m = building.floor_m + CURB_M, building.floor_m + CURB_M + building.size_m[2]
     low, high = np.full(len(x0), ground), np.full(len(x0), roof_m)
     at = [np.column_stack(corner) for corner in ((x0, y0, low), (x1, y1, low), (x1, y1, high), (x0, y0, high))]
-    corners = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(outline)))
-    roof = corners.reshape(-1, 4, 2)[:, :3]
-    one, two = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
-    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
-    roof[under] = roof[under][:, ::-1]
+    roof, _ = plan_triangles([outline])
     top = np.column_stack([roof.reshape(-1, 2), np.full(3 * len(roof), roof_m)])
     up = np.tile([0.0, 0.0, 1.0], (len(top), 1))
     return join([quads(np.stack(at, axis=1)), Mesh(top, up, np.arange(len(top), dtype=np.int32).reshape(-1, 3))])

@@ -19,7 +19,7 @@ from physics.street.mapped import MappedThings
 from physics.street.placement import street_style
 from physics.textures.layers import Colour
 from physics.world.materials import street_of
-from physics.world.mesh import Mesh, join, quads
+from physics.world.mesh import Mesh, join, plan_triangles, quads
 from physics.world.tiles import DRIVEWAY_M, Tile, square
 
 _LIFT_M: Final = 0.003
@@ -180,13 +180,7 @@ def _edged(mesh: Mesh) -> Mesh:
 def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
     """A part of a triangle, (3, 3) corners and normals, as triangles in its plane."""
     pieces = [p for p in shapely.get_parts(part) if shapely.get_dimensions(p) == 2]
-    flat = shapely.get_parts(shapely.constrained_delaunay_triangles(np.array(pieces, dtype=object)))
-    flat = shapely.get_parts(flat)
-    xy = shapely.get_coordinates(flat).reshape(-1, 4, 2)[:, :3]
-    one, two = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
-    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
-    xy[under] = xy[under][:, ::-1]
-    at = xy.reshape(-1, 2)
+    at = plan_triangles(pieces)[0].reshape(-1, 2)
     shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(np.column_stack([corners[:, :2], np.ones(3)]))
     z = shares @ corners[:, 2] + _LIFT_M
     slopes = shares @ normals

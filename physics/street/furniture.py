@@ -12,8 +12,9 @@ import shapely
 from numpy.typing import NDArray
 
 from physics.street import furniture_shapes as shapes
-from physics.street.furniture_shapes import METAL, WOOD, Part, Size, Solid
+from physics.street.furniture_shapes import METAL, WOOD, Size, Solid
 from physics.textures.layers import Colour
+from physics.world.mesh import Part
 
 Zone = Literal["verge", "curb", "frontage", "driveway"]
 """Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there is no verge;

@@ -15,8 +15,7 @@ import numpy as np
 from cosim.core.geometry import Floats
 from physics.street.tree_shapes import SPECIES, crown, tree_trunk
 from physics.street.vehicles import vehicle_parts
-from physics.textures.layers import Colour
-from physics.world.mesh import Mesh, box, disc, frustum, join
+from physics.world.mesh import Part, box, disc, frustum, join
 
 Size = tuple[float, float, float]
 """Length along the street, depth across it, height, in metres."""
@@ -44,17 +43,6 @@ class Solid:
     size_m: Size
     at_m: tuple[float, float] = (0.0, 0.0)
     low_m: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class Part:
-    """A mesh of one colour; None is the prop's own paint. What only some cameras show: cover, a layer of
-    physics.textures.walls that takes the colour ("": none); shade: (V,) light that reaches each corner, 0 to 1."""
-
-    mesh: Mesh
-    colour: Colour | None
-    cover: str = ""
-    shade: Floats | None = None
 
 
 def upright_solid(size: Size) -> tuple[Solid, ...]:
@@ -229,4 +217,4 @@ def fence(size: Size) -> tuple[Part, ...]:
 
 
 def car(size: Size) -> tuple[Part, ...]:
-    return tuple(Part(part.mesh, part.colour) for part in vehicle_parts("hatchback", size[0], size[1]))
+    return vehicle_parts("hatchback", size[0], size[1])

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Lane, StreetMap, Strip
-from physics.world.mesh import EMPTY, Mesh, join
+from physics.world.mesh import EMPTY, Mesh, join, plan_triangles
 from physics.world.tiles import Tile, key_at, kind_of, square
 
 LINE_M: Final = 0.12
@@ -154,11 +154,7 @@ def _draped(field: shapely.Geometry, ground: Mesh) -> Mesh:
     pieces = shapely.intersection(shapely.polygons(faces[:, :, :2]), field)
     own = shapely.area(pieces) > 1e-6
     faces, normal = faces[own], normal[own]
-    cut, of = shapely.get_parts(shapely.constrained_delaunay_triangles(pieces[own]), return_index=True)
-    xy = shapely.get_coordinates(cut).reshape(-1, 4, 2)[:, :3]
-    one, two = xy[:, 1] - xy[:, 0], xy[:, 2] - xy[:, 0]
-    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
-    xy[under] = xy[under][:, ::-1]
+    xy, of = plan_triangles(pieces[own])
     slope = normal[of, None, :2] / normal[of, None, 2:]
     z = faces[of, :1, 2] - ((xy - faces[of, :1, :2]) * slope).sum(axis=2)
     vertices = np.concatenate([xy, z[..., None] + _LIFT_M], axis=2).reshape(-1, 3)

@@ -14,7 +14,7 @@ from typing import Final, Literal, NamedTuple
 import numpy as np
 
 from physics.textures.layers import Colour
-from physics.world.mesh import Mesh, box, join, quads
+from physics.world.mesh import Mesh, Part, box, join, quads
 
 Shape = Literal["sedan", "hatchback", "estate", "suv", "van", "lorry", "bus", "scooter"]
 
@@ -38,13 +38,6 @@ _PROUD_M: Final = 0.012
 
 _Profile = Sequence[tuple[float, float]]
 """(x, z) of a convex outline seen from the right, counter-clockwise; x as a share of the length, z in metres."""
-
-
-class _Part(NamedTuple):
-    """A mesh of one colour; None is the vehicle's paint."""
-
-    mesh: Mesh
-    colour: Colour | None
 
 
 class _Car(NamedTuple):
@@ -90,7 +83,7 @@ def shape(name: str, length_m: float) -> Shape:
 
 
 @cache
-def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[_Part, ...]:
+def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[Part, ...]:
     """What is drawn of a vehicle of a size."""
     if shape == "scooter":
         return _scooter(length_m, width_m)
@@ -99,7 +92,7 @@ def vehicle_parts(shape: Shape, length_m: float, width_m: float) -> tuple[_Part,
     return {"van": _van, "lorry": _lorry, "bus": _bus}[shape](length_m, width_m)
 
 
-def _car(car: _Car, length_m: float, width_m: float) -> tuple[_Part, ...]:
+def _car(car: _Car, length_m: float, width_m: float) -> tuple[Part, ...]:
     half = 0.5 * width_m - 0.03
     lower = _hull([(x * length_m, z) for x, z in car.lower], half, half - 0.04)
     waist, roof = ([(x * length_m, z) for x, z in ends] for ends in (car.waist, car.roof))
@@ -111,16 +104,16 @@ def _car(car: _Car, length_m: float, width_m: float) -> tuple[_Part, ...]:
     lamps = [_plate(front, s * (half - 0.26), low - 0.08, 0.34, 0.14) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.20), car.waist[1][1] - 0.22, 0.28, 0.16) for s in (1, -1)]
     return (
-        _Part(join([lower, cabin]), None),
-        _Part(_panes(waist, roof, half - 0.05, half - 0.20), GLASS),
-        _Part(tyres, TYRE),
-        _Part(rims, RIM),
-        _Part(join(lamps), LAMP),
-        _Part(join(rear), REAR_LAMP),
+        Part(join([lower, cabin]), None),
+        Part(_panes(waist, roof, half - 0.05, half - 0.20), GLASS),
+        Part(tyres, TYRE),
+        Part(rims, RIM),
+        Part(join(lamps), LAMP),
+        Part(join(rear), REAR_LAMP),
     )
 
 
-def _van(length_m: float, width_m: float) -> tuple[_Part, ...]:
+def _van(length_m: float, width_m: float) -> tuple[Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     outline = [(-front, 0.35), (front, 0.32), (front, 0.95), (front - 0.9, 1.25), (front - 1.5, 2.25), (-front, 2.3)]
     body = _hull(outline, half, half - 0.10)
@@ -135,7 +128,7 @@ def _van(length_m: float, width_m: float) -> tuple[_Part, ...]:
     return _boxy(body, [*side, screen, back], length_m, half, 0.35, 0.8, 1.0)
 
 
-def _lorry(length_m: float, width_m: float) -> tuple[_Part, ...]:
+def _lorry(length_m: float, width_m: float) -> tuple[Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     cab = [(front - 1.9, 0.5), (front, 0.45), (front, 1.35), (front - 0.25, 2.5), (front - 1.9, 2.5)]
     load = box((length_m - 2.1, 2.0 * half, 2.2), (-1.05, 0.0, 2.0))
@@ -146,10 +139,10 @@ def _lorry(length_m: float, width_m: float) -> tuple[_Part, ...]:
     ]
     screen = _cross_pane((front - 0.02, 1.45), (front - 0.19, 2.25), half - 0.12, half - 0.12)
     parts = _boxy(_hull(cab, half, half - 0.04), [*side, screen], length_m, half, 0.45, 0.75, 0.95)
-    return (*parts, _Part(load, LAMP), _Part(frame, SKIN))
+    return (*parts, Part(load, LAMP), Part(frame, SKIN))
 
 
-def _bus(length_m: float, width_m: float) -> tuple[_Part, ...]:
+def _bus(length_m: float, width_m: float) -> tuple[Part, ...]:
     half, front = 0.5 * width_m - 0.03, 0.5 * length_m
     body = box((length_m, 2.0 * half, 2.65), (0.0, 0.0, 1.65))
     count = max(round((length_m - 1.6) / 1.5), 1)
@@ -169,7 +162,7 @@ def _bus(length_m: float, width_m: float) -> tuple[_Part, ...]:
 
 def _boxy(
     body: Mesh, panes: Sequence[Mesh], length_m: float, half: float, radius_m: float, lamp_m: float, rear_m: float
-) -> tuple[_Part, ...]:
+) -> tuple[Part, ...]:
     """A large vehicle from its body and panes: wheels and lamps are added. lamp_m, rear_m: heights of the lamps."""
     front = 0.5 * length_m
     wheels = [(x, s * (half - 0.12)) for x in (front - 0.22 * length_m, -front + 0.24 * length_m) for s in (1, -1)]
@@ -177,16 +170,16 @@ def _boxy(
     lamps = [_plate(front, s * (half - 0.25), lamp_m, 0.34, 0.18) for s in (1, -1)]
     rear = [_plate(-front, s * (half - 0.16), rear_m, 0.16, 0.40) for s in (1, -1)]
     return (
-        _Part(body, None),
-        _Part(join(list(panes)), GLASS),
-        _Part(tyres, TYRE),
-        _Part(rims, RIM),
-        _Part(join(lamps), LAMP),
-        _Part(join(rear), REAR_LAMP),
+        Part(body, None),
+        Part(join(list(panes)), GLASS),
+        Part(tyres, TYRE),
+        Part(rims, RIM),
+        Part(join(lamps), LAMP),
+        Part(join(rear), REAR_LAMP),
     )
 
 
-def _scooter(length_m: float, width_m: float) -> tuple[_Part, ...]:
+def _scooter(length_m: float, width_m: float) -> tuple[Part, ...]:
     """A two-wheeler and its rider, who wears a helmet."""
     front = 0.5 * length_m
     body = _hull([(-0.75 * front, 0.45), (0.3 * front, 0.28), (0.62 * front, 0.95), (-0.8 * front, 0.80)], 0.16, 0.13)
@@ -196,12 +189,12 @@ def _scooter(length_m: float, width_m: float) -> tuple[_Part, ...]:
     helmet = box((0.24, 0.22, 0.26), (0.10, 0.0, 1.62))
     tyres, rims = _wheels([(0.72 * front, 0.05), (-0.72 * front, 0.05)], 0.24, 0.10)
     return (
-        _Part(join([body, helmet]), None),
-        _Part(join([torso, bar, *legs]), SKIN),
-        _Part(tyres, TYRE),
-        _Part(rims, RIM),
-        _Part(_plate(0.66 * front, 0.0, 0.84, 0.14, 0.12), LAMP),
-        _Part(_plate(-0.80 * front, 0.0, 0.70, 0.12, 0.08), REAR_LAMP),
+        Part(join([body, helmet]), None),
+        Part(join([torso, bar, *legs]), SKIN),
+        Part(tyres, TYRE),
+        Part(rims, RIM),
+        Part(_plate(0.66 * front, 0.0, 0.84, 0.14, 0.12), LAMP),
+        Part(_plate(-0.80 * front, 0.0, 0.70, 0.12, 0.08), REAR_LAMP),
     )
 
 

@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
+from physics.textures.layers import Colour
 
 Ints = NDArray[np.int32]
 
@@ -47,6 +50,18 @@ class Mesh:
         turn = np.array([[cos, 0.0, sin], [0.0, 1.0, 0.0], [-sin, 0.0, cos]])
         pivot = np.asarray(pivot_m)
         return Mesh((self.vertices - pivot) @ turn.T + pivot, self.normals @ turn.T, self.triangles)
+
+
+class Part(NamedTuple):
+    """A mesh of one colour; None is the thing's own paint. What only some cameras show: cover, a layer of
+    physics.textures.walls that takes the colour, "lamp" for what shines at night ("": none); shade: (V,) light that
+    reaches each corner, 0 to 1; glows: shines in its colour."""
+
+    mesh: Mesh
+    colour: Colour | None = None
+    cover: str = ""
+    shade: Floats | None = None
+    glows: bool = False
 
 
 _idle_rows: list[list[float]] = []
@@ -106,6 +121,19 @@ def smooth_normals(vertices: Floats, triangles: Ints) -> Floats:
     for axis in range(3):
         total[:, axis] = np.bincount(triangles.ravel(), np.repeat(face[:, axis], 3), len(vertices))
     return np.asarray(total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12))
+
+
+def plan_triangles(areas: Sequence[shapely.Geometry] | NDArray[np.object_]) -> tuple[Floats, NDArray[np.int64]]:
+    """(T, 3, 2) corners of triangles that fill areas of the ground, counter-clockwise from above, and (T,) which area
+    each is of."""
+    parts, area = shapely.get_parts(
+        shapely.constrained_delaunay_triangles(np.asarray(areas, dtype=object)), return_index=True
+    )
+    corners = shapely.get_coordinates(parts).reshape(-1, 4, 2)[:, :3]
+    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    under = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
+    corners[under] = corners[under][:, ::-1]
+    return corners, area
 
 
 def quads(corners: Floats) -> Mesh:

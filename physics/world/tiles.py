@@ -27,7 +27,7 @@ from cosim.place import overlay
 from cosim.place.street_map import PieceKind, StreetMap, Strip, union_closed
 from cosim.place.terrain import Terrain
 from physics.world.materials import PAVINGS, Paving, cuts
-from physics.world.mesh import Mesh, quads, smooth_normals
+from physics.world.mesh import Mesh, join, plan_triangles, quads, smooth_normals
 from physics.world.relief import Relief, potholes
 
 TILE_M: Final = 48.0
@@ -296,11 +296,7 @@ def _triangulate(
     terrain: Terrain | None,
 ) -> dict[str, Mesh]:
     """A mesh for each surface, walls of the curbs included."""
-    triangle, face = shapely.get_parts(shapely.constrained_delaunay_triangles(faces), return_index=True)
-    corners = shapely.get_coordinates(triangle).reshape(-1, 4, 2)[:, :3]
-    one, two = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    swapped = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
-    corners[swapped] = corners[swapped][:, ::-1]
+    corners, face = plan_triangles(faces)
     grid, index = np.unique(np.rint(corners.reshape(-1, 2) / _GRID_M).astype(np.int64), axis=0, return_inverse=True)
     triangles = index.reshape(-1, 3)
     xy: Floats = grid.astype(float) * _GRID_M
@@ -315,7 +311,7 @@ def _triangulate(
         for i, name in enumerate(found)
     }
     walls = _walls(xy, land, high, triangles, lies_low[surface_of])
-    parts["curb"] = _append(parts["curb"], walls)
+    parts["curb"] = join([parts["curb"], walls])
     return {name: mesh for name, mesh in parts.items() if len(mesh)}
 
 
@@ -345,14 +341,6 @@ def _flat(xy: Floats, z: Floats, triangles: NDArray[np.int64], shaded: bool = Fa
         slopes = smooth_normals(vertices, corners)
         normals = np.where(slopes[:, 2:] > 0.0, slopes, normals)
     return Mesh(vertices, normals, corners)
-
-
-def _append(a: Mesh, b: Mesh) -> Mesh:
-    return Mesh(
-        np.concatenate([a.vertices, b.vertices]),
-        np.concatenate([a.normals, b.normals]),
-        np.concatenate([a.triangles, b.triangles + len(a.vertices)]).astype(np.int32),
-    )
 
 
 def _heights(

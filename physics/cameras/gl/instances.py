@@ -7,18 +7,16 @@ forms lie in one buffer, and the counts of a draw lie in another (multi-draw ind
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import moderngl
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from cosim.core.geometry import Floats
 from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corners
 from physics.cameras.gl.shading import Pass, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
-from physics.textures.layers import Colour
-from physics.world.mesh import Mesh
+from physics.world.mesh import Part
 
 INSTANCE: Final = np.dtype([("at", "f4", 3), ("turn", "f4", 4), ("paint", "u1", 4)])
 """at: metres from the anchor; turn: quaternion x, y, z, w; paint: colour, and the label as its fourth."""
@@ -74,17 +72,6 @@ void main() {{
 """
 
 
-class Coat(NamedTuple):
-    """A part of a form. colour: None is the instance's paint; glows: shines in it. cover: the layer of the surfaces
-    that lies on it, "lamp" for what shines at night, "" for nothing; shade: (V,) light that reaches its corners."""
-
-    mesh: Mesh
-    colour: Colour | None = None
-    glows: bool = False
-    cover: str = ""
-    shade: Floats | None = None
-
-
 class Forms:
     """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
 
@@ -104,14 +91,14 @@ class Forms:
         self._held = -1
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
 
-    def id(self, key: Hashable, parts: Callable[[], Sequence[Coat]]) -> int:
+    def id(self, key: Hashable, parts: Callable[[], Sequence[Part]]) -> int:
         """The number of a form; `parts` makes it when its key is new."""
         if key not in self._ids:
             self._add(key, parts())
         return self._ids[key]
 
-    def _add(self, key: Hashable, parts: Sequence[Coat]) -> None:
-        rows, indices = joined_corners([(coat.mesh, self._rows(coat)) for coat in parts])
+    def _add(self, key: Hashable, parts: Sequence[Part]) -> None:
+        rows, indices = joined_corners([(part.mesh, self._rows(part)) for part in parts])
         first, base = sum(map(len, self._indices)), sum(map(len, self._corners))
         self._corners.append(rows)
         self._indices.append(indices)
@@ -123,12 +110,12 @@ class Forms:
         self.draws = np.array(self._starts, dtype=np.uint32)
         self.version += 1
 
-    def _rows(self, coat: Coat) -> CornerRows:
-        shade = np.ones(len(coat.mesh.vertices)) if coat.shade is None else coat.shade
-        colour = np.tile(coat.colour, (len(shade), 1)) if coat.colour else np.ones((len(shade), 3))
-        rows = corners(coat.mesh, colour * shade[:, None], _GLOW if coat.glows else _OWN if coat.colour else _PAINT)
+    def _rows(self, part: Part) -> CornerRows:
+        shade = np.ones(len(part.mesh.vertices)) if part.shade is None else part.shade
+        colour = np.tile(part.colour, (len(shade), 1)) if part.colour else np.ones((len(shade), 3))
+        rows = corners(part.mesh, colour * shade[:, None], _GLOW if part.glows else _OWN if part.colour else _PAINT)
         named = {"": _BARE, "lamp": _LAMP}
-        rows["normal"][:, 3] = named[coat.cover] if coat.cover in named else self._layers.index(coat.cover)
+        rows["normal"][:, 3] = named[part.cover] if part.cover in named else self._layers.index(part.cover)
         return rows
 
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:

@@ -10,15 +10,14 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
-from physics.cameras.gl.instances import Coat
 from physics.world.bullet import p
-from physics.world.mesh import Mesh, box, frustum, join
+from physics.world.mesh import Mesh, Part, box, frustum, join
 
 _GREY = (0.6, 0.6, 0.6)
 
 
 @lru_cache(maxsize=8)
-def robot_parts(urdf: Path) -> tuple[Coat, ...]:
+def robot_parts(urdf: Path) -> tuple[Part, ...]:
     """What is drawn of a robot in its base frame, wheels as they stand. Raises EngineError for an unknown shape."""
     root = xml.parse(urdf).getroot()
     colours = {m.get("name", ""): _colour(m) for m in root.findall("material")}
@@ -33,7 +32,7 @@ def robot_parts(urdf: Path) -> tuple[Coat, ...]:
             material = visual.find("material")
             name = material.get("name", "") if material is not None else ""
             turned = Mesh(vertices, mesh.normals @ own_turn.T @ turn.T, mesh.triangles)
-            parts.append(Coat(turned, colours.get(name, _GREY)))
+            parts.append(Part(turned, colours.get(name, _GREY)))
     return tuple(parts)
 
 

@@ -19,21 +19,22 @@ from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.crowd import CrowdDrawing
-from physics.cameras.gl.instances import INSTANCE, Coat, Forms, Things, instances
+from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.robot_body import robot_parts
 from physics.cameras.gl.shading import Pass
 from physics.cameras.gl.shadows import SHADOW_REACH_M, STEP_M, middle_of
-from physics.cameras.gl.surfaces import surfaces
-from physics.cameras.gl.tiles import TileBuffers, tile_shaders
-from physics.cameras.gl.walls import WallBuffers, wall_shaders
+from physics.cameras.gl.surfaces import TileBuffers, surfaces
+from physics.cameras.gl.tiles import ground_buffers, tile_shaders
+from physics.cameras.gl.walls import wall_buffers, wall_shaders
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
 from physics.robots import urdf_of
 from physics.street import props, vehicles
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
 from physics.world.bullet import p
-from physics.world.surface import Patch, Surface
+from physics.world.mesh import Part
+from physics.world.surface import Surface
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
 
 CAST_M: Final = 18.0
@@ -53,9 +54,9 @@ class _Tile:
     thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
 
     middle: Floats
-    ground: TileBuffers | None
-    paint: TileBuffers | None
-    walls: WallBuffers
+    ground: TileBuffers
+    paint: TileBuffers
+    walls: TileBuffers
     things: _Placed
     thing_xy: Floats
     seen_m: Floats
@@ -63,10 +64,8 @@ class _Tile:
     post_z: Floats
 
     def release(self) -> None:
-        for laid_out in (self.ground, self.paint):
-            if laid_out is not None:
-                laid_out.release()
-        self.walls.release()
+        for buffers in (self.ground, self.paint, self.walls):
+            buffers.release()
 
 
 class GlScene:
@@ -150,14 +149,12 @@ class GlScene:
         if stage != "moving":
             for tile in self._in_view if stage == "colour" else self._shading:
                 tile.walls.draw(stage, self._anchor)
-                if tile.ground is not None:
-                    tile.ground.draw(stage, self._anchor)
+                tile.ground.draw(stage, self._anchor)
 
     def draw_paint(self) -> None:
         """Draw what lies on the ground; to be drawn after it, without labels and depth."""
         for tile in self._in_view:
-            if tile.paint is not None:
-                tile.paint.draw("colour", self._anchor)
+            tile.paint.draw("colour", self._anchor)
 
     def release(self) -> None:
         for tile in self._tiles.values():
@@ -185,9 +182,9 @@ class GlScene:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
         chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
-        ground = self._laid_out((*finish.laid, *chunk.ground), middle)
-        painted = self._laid_out(finish.painted, middle)
-        walls = WallBuffers(self._context, self._wall_shaders, chunk.buildings, finish.styles, middle)
+        ground = ground_buffers(self._context, self._shaders, (*finish.laid, *chunk.ground), middle)
+        painted = ground_buffers(self._context, self._shaders, finish.painted, middle)
+        walls = wall_buffers(self._context, self._wall_shaders, chunk.buildings, finish.styles, middle)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._surface.heights(post_xy)
         furniture = chunk.props
@@ -195,7 +192,7 @@ class GlScene:
         xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
         rows = instances(xyz, [prop.drawn_rad for prop, _ in furniture], paint, LABELS["prop"])
-        pole = self._forms.id(("signal", "post"), lambda: [Coat(props.post_mesh(), props.POLE)])
+        pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         headings = [post.heading_rad for post in posts]
         poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
         things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
@@ -203,13 +200,10 @@ class GlScene:
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
         return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
 
-    def _laid_out(self, patches: Sequence[Patch], middle: Floats) -> TileBuffers | None:
-        return TileBuffers(self._context, self._shaders, patches, middle) if patches else None
-
     def _prop_form(self, prop: Prop) -> int:
         return self._forms.id(
             ("prop", *prop.form),
-            lambda: [Coat(part.mesh, part.colour, False, part.cover, part.shade) for part in parts_of(*prop.form)],
+            lambda: parts_of(*prop.form),
         )
 
     def _things(self, view: View) -> _Placed:
@@ -238,7 +232,7 @@ class GlScene:
         z = self._surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
-        form = self._forms.id(("barrier", *size), lambda: [Coat(red, props.PROP_RED), Coat(white, props.PROP_WHITE)])
+        form = self._forms.id(("barrier", *size), lambda: [Part(red, props.PROP_RED), Part(white, props.PROP_WHITE)])
         rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
         return np.array([form]), rows
 
@@ -295,7 +289,7 @@ class GlScene:
         if key not in self._fleet:
             size = tuple(np.array([length_m, width_m]).round(1).tolist())
             shape = vehicles.shape(name, size[0])
-            form = self._forms.id(("vehicle", shape, *size), partial(_vehicle, shape, *size))
+            form = self._forms.id(("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size))
             self._fleet[key] = form, vehicles.paint(name)
         return self._fleet[key]
 
@@ -309,12 +303,8 @@ class GlScene:
         return np.array([form]), rows
 
 
-def _lamp(walk: bool) -> list[Coat]:
-    return [Coat(props.lamp_mesh(walk), None, glows=True)]
-
-
-def _vehicle(shape: vehicles.Shape, length_m: float, width_m: float) -> list[Coat]:
-    return [Coat(part.mesh, part.colour) for part in vehicles.vehicle_parts(shape, length_m, width_m)]
+def _lamp(walk: bool) -> list[Part]:
+    return [Part(props.lamp_mesh(walk), glows=True)]
 
 
 def _set(things: Things, placed: Sequence[_Placed]) -> None:

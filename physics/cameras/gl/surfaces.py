@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final
@@ -11,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, programs
+from physics.cameras.gl.corners import CornerRows, joined_corners
+from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Pass, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined_layers
 from physics.textures.walls import prop_layers, wall_layers
+from physics.world.mesh import Mesh
 
 SIZE_PX: Final = 256
 LAYERS_MAX: Final = 72
@@ -63,22 +66,40 @@ class SurfaceShaders:
                 uniform.write(surfaces.known)
 
 
-class TilePlace:
-    """Where a tile is, as its programs read it. middle: (2,) world metres."""
+class TileBuffers:
+    """Meshes of one tile with their rows as vertices, uploaded once and drawn in their order. layout: of a row, as
+    moderngl wants it; middle: (2,) world metres of the tile's, from which positions are measured."""
 
-    def __init__(self, context: moderngl.Context, middle: Floats) -> None:
+    def __init__(
+        self,
+        context: moderngl.Context,
+        shaders: SurfaceShaders,
+        layout: tuple[str, ...],
+        parts: Sequence[tuple[Mesh, CornerRows]],
+        middle: Floats,
+    ) -> None:
         self._middle, self._anchor = middle, np.full(2, np.nan)
-        self._buffer = context.buffer(reserve=16)
-        self.content = self._buffer, "2f 2f /i", "middle", "middle_in_world"
+        self._place = context.buffer(reserve=16)
+        self._buffers = [self._place]
+        self._arrays: list[moderngl.VertexArray] = []
+        if parts:
+            rows, triangles = (context.buffer(held.tobytes()) for held in joined_corners(parts))
+            self._buffers += [rows, triangles]
+            content = [(rows, *layout), (self._place, "2f 2f /i", "middle", "middle_in_world")]
+            self._arrays = [context.vertex_array(one, content, triangles, skip_errors=True) for one in shaders.programs]
 
-    def seen_from(self, anchor: Floats) -> None:
-        """Be at the middle from (2,) `anchor` on."""
-        if anchor is not self._anchor:
-            self._anchor = anchor
-            self._buffer.write(np.concatenate([self._middle - anchor, self._middle]).astype(np.float32))
+    def draw(self, stage: Pass, anchor: Floats) -> None:
+        if self._arrays and stage != "moving":
+            if anchor is not self._anchor:
+                self._anchor = anchor
+                self._place.write(np.concatenate([self._middle - anchor, self._middle]).astype(np.float32))
+            self._arrays[stage != "colour"].render()
 
     def release(self) -> None:
-        self._buffer.release()
+        for array in self._arrays:
+            array.release()
+        for buffer in self._buffers:
+            buffer.release()
 
 
 @lru_cache(maxsize=1)

@@ -9,9 +9,8 @@ import moderngl
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
-from physics.cameras.gl.shading import Pass
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
+from physics.cameras.gl.corners import LAYOUT, corners
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileBuffers
 from physics.world.surface import Patch
 
 _TINTED: Final = 128
@@ -49,34 +48,14 @@ def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
-class TileBuffers:
+def ground_buffers(
+    context: moderngl.Context, shaders: SurfaceShaders, patches: Sequence[Patch], middle: Floats
+) -> TileBuffers:
     """Patches of one tile, drawn in their order. middle: (2,) world metres of the tile's."""
-
-    def __init__(
-        self, context: moderngl.Context, shaders: SurfaceShaders, patches: Sequence[Patch], middle: Floats
-    ) -> None:
-        parts = []
-        for patch in patches:
-            here = patch.mesh.moved((*-middle, 0.0))
-            rows = corners(here, patch.colour, LABELS[patch.label] + (_TINTED if patch.tinted else 0))
-            rows["normal"][:, 3] = shaders.surfaces.surfaces.index(patch.layer)
-            parts.append((here, rows))
-        rows, triangles = joined_corners(parts)
-        self._spot = TilePlace(context, middle)
-        self._corners, self._triangles = context.buffer(rows.tobytes()), context.buffer(triangles.tobytes())
-        content = [(self._corners, *LAYOUT), self._spot.content]
-        self._arrays = [
-            context.vertex_array(program, content, self._triangles, skip_errors=True) for program in shaders.programs
-        ]
-
-    def draw(self, stage: Pass, anchor: Floats) -> None:
-        if stage != "moving":
-            self._spot.seen_from(anchor)
-            self._arrays[stage != "colour"].render()
-
-    def release(self) -> None:
-        for array in self._arrays:
-            array.release()
-        self._corners.release()
-        self._triangles.release()
-        self._spot.release()
+    parts = []
+    for patch in patches:
+        here = patch.mesh.moved((*-middle, 0.0))
+        rows = corners(here, patch.colour, LABELS[patch.label] + (_TINTED if patch.tinted else 0))
+        rows["normal"][:, 3] = shaders.surfaces.surfaces.index(patch.layer)
+        parts.append((here, rows))
+    return TileBuffers(context, shaders, LAYOUT, parts, middle)

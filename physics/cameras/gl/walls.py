@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, Pass
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TilePlace
+from physics.cameras.gl.corners import CornerRows
+from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileBuffers
 from physics.street.buildings import Building, facade_meshes
 from physics.street.fronts import NARROWEST_FRONT_M, face_of
 from physics.textures.facade_canvas import BAY_M, STOREY_M
@@ -95,50 +96,21 @@ def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, n
     return SurfaceShaders(context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows)
 
 
-class WallBuffers:
+def wall_buffers(
+    context: moderngl.Context,
+    shaders: SurfaceShaders,
+    buildings: Sequence[Building],
+    styles: Sequence[WallStyle],
+    middle: Floats,
+) -> TileBuffers:
     """The buildings of one tile, each of a style. middle: (2,) world metres of the tile's."""
-
-    def __init__(
-        self,
-        context: moderngl.Context,
-        shaders: SurfaceShaders,
-        buildings: Sequence[Building],
-        styles: Sequence[WallStyle],
-        middle: Floats,
-    ) -> None:
-        self._spot = TilePlace(context, middle)
-        styled = zip(buildings, styles, strict=True)
-        parts = [rows for b, style in styled for rows in _rows(b, style, shaders.surfaces, middle)]
-        self._arrays: list[moderngl.VertexArray] = []
-        self._buffers: list[moderngl.Buffer] = []
-        if not parts:
-            return
-        starts = np.cumsum([0, *(len(rows) for rows, _ in parts)])
-        indices = [triangles.ravel() + start for (_, triangles), start in zip(parts, starts, strict=False)]
-        held = np.concatenate([rows for rows, _ in parts]), np.concatenate(indices).astype(np.uint32)
-        self._buffers = [context.buffer(array.tobytes()) for array in held]
-        content = [(self._buffers[0], *_LAYOUT), self._spot.content]
-        self._arrays = [
-            context.vertex_array(program, content, self._buffers[1], skip_errors=True) for program in shaders.programs
-        ]
-
-    def draw(self, stage: Pass, anchor: Floats) -> None:
-        if self._arrays and stage != "moving":
-            self._spot.seen_from(anchor)
-            self._arrays[stage != "colour"].render()
-
-    def release(self) -> None:
-        for array in self._arrays:
-            array.release()
-        for buffer in self._buffers:
-            buffer.release()
-        self._spot.release()
+    styled = zip(buildings, styles, strict=True)
+    parts = [part for b, style in styled for part in _parts(b, style, shaders.surfaces, middle)]
+    return TileBuffers(context, shaders, _LAYOUT, parts, middle)
 
 
-def _rows(
-    building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats
-) -> list[tuple[NDArray[np.void], NDArray[np.int32]]]:
-    """Corners and triangles of a building's walls and roof."""
+def _parts(building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats) -> list[tuple[Mesh, CornerRows]]:
+    """A building's walls and roof, with their rows."""
     face = face_of(building, style)
     layers, bays = surfaces.surfaces, surfaces.facades
     wall, roof = layers.index(face.wall), layers.index(face.roof)
@@ -164,7 +136,7 @@ def _rows(
         fronted = (mesh.normals @ street > 0.9) | (building.outline is not None)
         rows["kind"] = np.stack([np.full(len(rows), upper), storeys, fronted, np.full(len(rows), chance[0])], 1)
         rows["fronts"] = *fronts, doors, chance[1]
-        found.append((rows, mesh.triangles))
+        found.append((mesh, rows))
     return found
 
 
