@@ -18,7 +18,7 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import Command, Frame, RobotState, Street
 from cosim.episode.ports import Camera, Crowd, Director, World
 from cosim.episode.step import Reset, Step
-from cosim.people.neighbours import bystanders
+from cosim.people.neighbours import nearby_people
 from cosim.spec.events import EventQuery, EventState
 from cosim.spec.scenario import Scenario
 
@@ -89,7 +89,7 @@ def query(scenario: Scenario, clock: Clock, now: Moment, footprint_m: tuple[floa
         robot_width_m=footprint_m[1],
         events=scenario.events,
         states=now.states,
-        bystanders=bystanders(now.street.people),
+        nearby=nearby_people(now.street.people),
     )
 
 

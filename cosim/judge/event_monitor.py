@@ -1,4 +1,4 @@
-"""The witness of an episode's events: when they triggered, whether the camera could see them, whether their rules held.
+"""Watches the events of an episode: when they triggered, whether the camera could see them, whether their rules held.
 
 Rules beyond the goal (the paper's table): the robot passes round the whole group of `conversing` and the whole line of
 `queueing` (`EventKind.passed_round`), never between two of them. (`gesturing` ends its episode by a stop: see the
@@ -28,7 +28,7 @@ PASSED_M: Final = 5.0
 """An event lies behind once the robot is this far beyond its place."""
 
 
-class Witness:
+class EventMonitor:
     """Watches the steps of one episode, in order. kinds: the table of its events."""
 
     def __init__(self, scenario: Scenario, kinds: EventKinds, tick_ms: int) -> None:
@@ -100,7 +100,7 @@ def _side(a: Floats, b: Floats, p: Floats) -> float:
     return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
 
 
-def unwitnessed(event: Event, outcome: TriggeredEvent) -> str:
+def why_invalid(event: Event, outcome: TriggeredEvent) -> str:
     """Why an event says nothing about the robot, in words; "" if it does."""
     if outcome.triggered_at_s is None:
         return f"event {event.id} ({event.kind}) never triggered"

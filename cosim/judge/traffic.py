@@ -37,7 +37,7 @@ class OnRoad(NamedTuple):
     braked: int = 0
 
 
-class Roadway:
+class TrafficMonitor:
     """Judges the Steps of one episode, in order."""
 
     def __init__(self, street_map: StreetMap, tick_s: float) -> None:

@@ -6,14 +6,14 @@ import numpy as np
 
 from cosim.core.state import DIRECTED, People, PersonKind
 from cosim.people.steering import STEERING_NEAR_M
-from cosim.spec.events import Bystander
+from cosim.spec.events import NearbyPerson
 
 
-def bystanders(people: People) -> tuple[Bystander, ...]:
+def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
     """Those within STEERING_NEAR_M of somebody the director moves, in the order of the street; not the events' own
     people.
 
-    The events' people are in the states of a query. Guests are moved by the director and see each other here.
+    The events' people are in the states of a query. Injected people are moved by the director and see each other here.
     """
     moved = people.xy[people.are(*DIRECTED)]
     if not len(moved):
@@ -26,4 +26,4 @@ def bystanders(people: People) -> tuple[Bystander, ...]:
     heading, speed = people.heading, people.speed
     vx, vy = (speed[rows] * np.cos(heading[rows])).tolist(), (speed[rows] * np.sin(heading[rows])).tolist()
     told = zip(rows, people.xy[rows].tolist(), vx, vy, people.kind[rows].tolist(), strict=True)
-    return tuple(Bystander(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told)
+    return tuple(NearbyPerson(people.ids[i], x, y, u, v, PersonKind(kind)) for i, (x, y), u, v, kind in told)

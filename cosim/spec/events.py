@@ -107,7 +107,7 @@ class Actor(msgspec.Struct, frozen=True, kw_only=True):
     pace_mps: float | None = None
 
 
-class Bystander(msgspec.Struct, frozen=True, array_like=True):
+class NearbyPerson(msgspec.Struct, frozen=True, array_like=True):
     """Somebody who is not of an event: place, velocity and kind."""
 
     id: str
@@ -122,7 +122,7 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
     route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
-    bystanders: who is near the people that the director moves, see `cosim.people.neighbours`.
+    nearby: who is near the people that the director moves, see `cosim.people.neighbours`.
     """
 
     episode: str
@@ -138,7 +138,7 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     robot_width_m: float
     events: tuple[Event, ...]
     states: tuple[EventState, ...] = ()
-    bystanders: tuple[Bystander, ...] = ()
+    nearby: tuple[NearbyPerson, ...] = ()
 
 
 class EventReply(msgspec.Struct, frozen=True, kw_only=True):

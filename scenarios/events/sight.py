@@ -11,7 +11,7 @@ import msgspec
 from cosim.core.state import PERSON_RADIUS_M, PersonKind
 from cosim.people.orca import HalfPlane
 from cosim.people.steering import HORIZON_S, ROOM_M, SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
-from cosim.spec.events import Bystander, Event, EventQuery, Walker
+from cosim.spec.events import Event, EventQuery, NearbyPerson, Walker
 
 COMES_UP_M = 1.5
 """From here on, who insists on a place walks up to whoever is there, not round."""
@@ -47,7 +47,7 @@ class Sight(NamedTuple):
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
-    """The sight of person `number` of an event: it sees its fellows, people of other events, and bystanders.
+    """The sight of person `number` of an event: it sees its fellows, people of other events, and nearby.
 
     waited_s: how long it has been on its way to a place on which it insists.
     """
@@ -59,38 +59,36 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
         if (one.id, k) != (event.id, number)
     ]
     if waited_s < PRESSES_S:
-        others += met(query.bystanders)
+        others += met(query.nearby)
     return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else SHOULDER_TO_SHOULDER_M)
 
 
-def sight_of_guest(name: str, guest: Walker, query: EventQuery) -> Sight:
-    """The sight of the guest that is shown under this id."""
+def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:
+    """The sight of the person that is shown under this id."""
     walkers = [walker for state in query.states if state.phase != "gone" for walker in state.walkers]
-    others = (_told_apart(name, guest, one) for one in query.bystanders if one.id != name)
+    others = (_told_apart(name, person, one) for one in query.nearby if one.id != name)
     return Sight(query, [*map(fellow, walkers), *met(others)])
 
 
-def _told_apart(name: str, guest: Walker, other: Bystander) -> Bystander:
+def _told_apart(name: str, person: Walker, other: NearbyPerson) -> NearbyPerson:
     """Who is in the very same place, as two are who are injected there at once, is seen a little to one side: else they
     would walk in each other for ever."""
-    if math.hypot(other.x_m - guest.x_m, other.y_m - guest.y_m) > SAME_M:
+    if math.hypot(other.x_m - person.x_m, other.y_m - person.y_m) > SAME_M:
         return other
     left_m = SAME_M if name < other.id else -SAME_M
-    cos, sin = math.cos(guest.heading_rad), math.sin(guest.heading_rad)
-    return msgspec.structs.replace(other, x_m=guest.x_m - left_m * sin, y_m=guest.y_m + left_m * cos)
+    cos, sin = math.cos(person.heading_rad), math.sin(person.heading_rad)
+    return msgspec.structs.replace(other, x_m=person.x_m - left_m * sin, y_m=person.y_m + left_m * cos)
 
 
-def fellow(walker: Walker | Bystander) -> Neighbour:
+def fellow(walker: Walker | NearbyPerson) -> Neighbour:
     """Somebody who steers the same way, but for who stands: that one stays."""
     moves = walker.vx_mps != 0.0 or walker.vy_mps != 0.0
     return Neighbour(walker.x_m, walker.y_m, walker.vx_mps, walker.vy_mps, SHARED if moves else 1.0)
 
 
-def met(bystanders: Iterable[Bystander]) -> list[Neighbour]:
-    """The crowd pays no heed; guests and residents who walk steer the same way."""
-    return [
-        Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b) for b in bystanders
-    ]
+def met(nearby: Iterable[NearbyPerson]) -> list[Neighbour]:
+    """The crowd pays no heed; injected people and residents who walk steer the same way."""
+    return [Neighbour(b.x_m, b.y_m, b.vx_mps, b.vy_mps) if b.kind == PersonKind.CROWD else fellow(b) for b in nearby]
 
 
 def place_taken(walker: Walker, goal: Vector, sight: Sight) -> bool:

@@ -1,7 +1,7 @@
 """An episode beside the same street without its robot: who was delayed, and by how much.
 
 When the episode is over its street is simulated again from the same seed: the same people and vehicles come and go at
-the same moments, the same event pedestrians and guests are where they were, but nothing is where the robot was.
+the same moments, event pedestrians and injected people are where they were, but nothing is where the robot was.
 """
 
 from __future__ import annotations
@@ -74,5 +74,5 @@ class Beside:
 
 
 def _crowd(street: Street) -> People:
-    """Those who come and go by themselves: event pedestrians and guests are where they were."""
+    """Those who come and go by themselves: event pedestrians and injected people are where they were."""
     return street.people.only(np.flatnonzero(street.people.are(PersonKind.CROWD)))

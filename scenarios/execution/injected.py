@@ -1,4 +1,4 @@
-"""Guests: injected pedestrians beside those of the events. A director around a director.
+"""Injected people: injected pedestrians beside those of the events. A director around a director.
 
 Injections come from any thread, or from a record that is replayed; they take effect at the boundary of a step, in the
 order in which they came.
@@ -15,16 +15,16 @@ import msgspec
 from cosim.episode.ports import Director
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection
-from scenarios.events.guest import Guest, arriving, guest_actor, guest_moved_on
+from scenarios.events.injected_person import InjectedPerson, arriving, injected_actor, injected_moved_on
 
-MOST_GUESTS: Final = 100
+MOST_INJECTED: Final = 100
 """At once, those under way to their first step included."""
 MOST_EVER: Final = 5000
 """In one episode: its record holds them all."""
 
 
-class Guests:
-    """Adds guests to another director's replies. on_map(x_m, y_m): whether a point belongs to the place at all."""
+class InjectedPeople:
+    """Joins another director's replies. on_map(x_m, y_m): whether a point belongs to the place at all."""
 
     def __init__(
         self, director: Director, tick_ms: int, on_map: Callable[[float, float], bool], script: Sequence[Injected] = ()
@@ -33,7 +33,7 @@ class Guests:
         self._lock = Lock()
         self._coming: list[Injected] = list(script)
         self._log: list[Injected] = []
-        self._here: dict[str, Guest] = {}
+        self._here: dict[str, InjectedPerson] = {}
         self._names = {entry.injection.id for entry in script}
         self._next_tick = 0
 
@@ -46,8 +46,8 @@ class Guests:
                 reason = f"path holds ({off[0]:g}, {off[1]:g}): that is not on this map"
             elif injection.id in self._names:
                 reason = "there was one of this id in the episode already"
-            elif len(self._here) + len(self._coming) >= MOST_GUESTS:
-                reason = f"{MOST_GUESTS} injected pedestrians are here already: wait until some are gone"
+            elif len(self._here) + len(self._coming) >= MOST_INJECTED:
+                reason = f"{MOST_INJECTED} injected pedestrians are here already: wait until some are gone"
             elif len(self._names) >= MOST_EVER:
                 reason = f"{MOST_EVER} pedestrians were injected into this episode: no more"
             if reason:
@@ -64,7 +64,7 @@ class Guests:
             return tuple(self._log)
 
     def react(self, query: EventQuery) -> EventReply:
-        """The director's reply, with the guests of this tick among its actors."""
+        """The director's reply, with the injected people of this tick among its actors."""
         with self._lock:
             due = [entry for entry in self._coming if entry.tick <= query.tick]
             self._coming = [entry for entry in self._coming if entry.tick > query.tick]
@@ -74,8 +74,8 @@ class Guests:
             self._here = before | new
         reply = self._director.react(query)
         here = {}
-        for name, guest in before.items():
-            after = guest_moved_on(guest, query)
+        for name, person in before.items():
+            after = injected_moved_on(person, query)
             if after is not None:
                 here[name] = after
         here |= new
@@ -83,5 +83,5 @@ class Guests:
             self._here = here
         if not here:
             return reply
-        actors = (*reply.actors, *(guest_actor(guest, self._tick_ms) for guest in here.values()))
+        actors = (*reply.actors, *(injected_actor(person, self._tick_ms) for person in here.values()))
         return msgspec.structs.replace(reply, actors=actors)

@@ -19,7 +19,7 @@ from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.spec.injection import Injected, Live
 from cosim.spec.scenario import Scenario
-from scenarios.execution.injected import Guests
+from scenarios.execution.injected import InjectedPeople
 
 
 class _Told(msgspec.Struct, frozen=True, kw_only=True):
@@ -33,8 +33,8 @@ class _Told(msgspec.Struct, frozen=True, kw_only=True):
 class OnAir:
     """One episode's end of the air. Use in a `with` block."""
 
-    def __init__(self, live: Live, scenario: Scenario, guests: Guests) -> None:
-        self._live, self._scenario, self._guests = live, scenario, guests
+    def __init__(self, live: Live, scenario: Scenario, injected: InjectedPeople) -> None:
+        self._live, self._scenario, self._injected = live, scenario, injected
         self._below = keys.env(live.run, keys.chunk(scenario.id))
         self._step: Step | None = None
         self._happened: list[tuple[int, str]] = []
@@ -43,7 +43,7 @@ class OnAir:
 
     def __enter__(self) -> Self:
         self._session = Session.client(self._live.endpoint)
-        serve_injections(self._session, f"{self._below}/inject", self._guests.offer)
+        serve_injections(self._session, f"{self._below}/inject", self._injected.offer)
         self._session.serve(f"{self._below}/status", lambda _: self._status(), found=True)
         self._session.serve(f"{self._below}/log", lambda _: self._log())
         self._session.serve(f"{self._below}/camera", lambda _: self._camera())
@@ -107,7 +107,7 @@ class OnAir:
 
     def _log(self) -> bytes:
         tick = -1 if self._step is None else self._step.tick
-        return msgspec.json.encode(_Told(tick=tick, injections=self._guests.log, happened=tuple(self._happened)))
+        return msgspec.json.encode(_Told(tick=tick, injections=self._injected.log, happened=tuple(self._happened)))
 
     def _camera(self) -> bytes:
         """The last picture that the policy got, as PNG. Raises LookupError before there is one."""

@@ -7,10 +7,10 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.episode.log import Log
 from cosim.episode.step import Step
-from cosim.judge.event_monitor import Witness, unwitnessed
+from cosim.judge.event_monitor import EventMonitor, why_invalid
 from cosim.judge.metrics import EpisodeFacts, every_metric
 from cosim.judge.referee import Failure, Referee, Verdict
-from cosim.judge.traffic import Roadway
+from cosim.judge.traffic import TrafficMonitor
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.records.record import Record, Recorder, TriggeredEvent
 from cosim.spec.event_kind import EventKinds
@@ -33,8 +33,8 @@ class Scorer:
         self._scenario = scenario
         self._referee = Referee(scenario, area, footprint_m, clock)
         self._recorder = Recorder(clock.tick_s)
-        self._monitor = Witness(scenario, kinds, clock.tick_ms)
-        self._traffic = Roadway(street_map, clock.tick_s)
+        self._monitor = EventMonitor(scenario, kinds, clock.tick_ms)
+        self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
         self._red_lights = 0
         self._verdict = Verdict()
@@ -77,5 +77,5 @@ def unseen(scenario: Scenario, events: tuple[TriggeredEvent, ...]) -> str:
     """
     if not scenario.ends_on_failure:
         return ""
-    reasons = [unwitnessed(event, outcome) for event, outcome in zip(scenario.events, events, strict=True)]
+    reasons = [why_invalid(event, outcome) for event, outcome in zip(scenario.events, events, strict=True)]
     return "; ".join(filter(None, reasons))

@@ -29,7 +29,7 @@ from physics.world.surface import Surface
 from physics.world.world import BulletWorld
 from scenarios.builders.barriers import fenced
 from scenarios.execution.directing import director_of
-from scenarios.execution.injected import Guests
+from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place
 from scenarios.execution.scorer import Scorer
 from scenarios.residents.director import among_residents
@@ -55,7 +55,7 @@ class StagedScenario:
     scorer: Scorer
     known: Callable[[Moment], Privileged]
     eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
-    injected: Guests
+    injected: InjectedPeople
     entrances: Entrances
 
 
@@ -88,7 +88,7 @@ def staged(
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
-        injected = Guests(director, clock.tick_ms, partial(on_map, street_map), options.injections)
+        injected = InjectedPeople(director, clock.tick_ms, partial(on_map, street_map), options.injections)
         footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
         free = shapely.buffer(footing, -robot.width_m / 2)
         shapely.prepare(free)

@@ -19,7 +19,7 @@ from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, Companies
+from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
 from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
 from sumo_nets.crowd.room import Room
 from sumo_nets.crowd.spots import EntrySpot, Spots
@@ -95,7 +95,7 @@ class Pedestrians:
             step_m=2.0,
         )
         self._room = Room(street_map, spec.radius_m)
-        self._companies = Companies(spec, rng.spawn(1)[0])
+        self._groups = GroupDraws(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
         """Everybody at once, before the episode."""
@@ -130,7 +130,7 @@ class Pedestrians:
         missing = self.wanted(x_m, y_m) - len(inside)
         if not isinstance(self._spec.density, msgspec.UnsetType):
             far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
-            spare = -missing - (0 if self._companies.plain else 1)
+            spare = -missing - (0 if self._groups.plain else 1)
             for name in far:
                 if len(fellows(name)) <= spare:
                     spare -= len(fellows(name))
@@ -152,16 +152,16 @@ class Pedestrians:
             return
         taken = [(p.x_m, p.y_m) for p in seen.values()]
         for _ in range(4 * count):
-            company = self._companies.coming
-            if 2 * count < company.size:
+            group = self._groups.coming
+            if 2 * count < group.size:
                 return
             spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
-            forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*company.pace_mps))
+            forward, drawn_mps = bool(self._rng.random() < 0.5), float(self._rng.uniform(*group.pace_mps))
             width_m = self._widths_m[spot.edge]
-            half_m = max(width_m / 2 - _EDGE_M - (company.abreast(width_m) - 1) * GROUP_STRIPE_M / 2, 0.0)
+            half_m = max(width_m / 2 - _EDGE_M - (group.abreast(width_m) - 1) * GROUP_STRIPE_M / 2, 0.0)
             middle_m = float(self._rng.uniform(-half_m, half_m))
             back = -1.0 if forward else 1.0
-            places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in company.places(width_m)]
+            places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in group.places(width_m)]
             if any(
                 np.hypot(x - other_x, y - other_y) < _PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
             ):
@@ -169,14 +169,14 @@ class Pedestrians:
             walk = self._graph.wander(self._rng, spot.edge, forward, _WALK_EDGES, self._closed)
             if len(walk) == 1:
                 continue
-            walk, speed_mps = self._one_way(walk, forward), company.walks_at(drawn_mps)
-            names = [self._name(age) for age in company.ages]
+            walk, speed_mps = self._one_way(walk, forward), group.walks_at(drawn_mps)
+            names = [self._name(age) for age in group.ages]
             for name, xy in zip(names, places, strict=True):
                 self._add(name, spot, walk, speed_mps, xy)
             self._together.join(names, speed_mps, walk)
-            self._companies.entered()
+            self._groups.entered()
             taken += places
-            count -= company.size
+            count -= group.size
             if count <= 0:
                 return
 

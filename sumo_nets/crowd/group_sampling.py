@@ -1,4 +1,4 @@
-"""Company: who enters the street together, how old they are, how fast they walk, how they stand beside each other.
+"""Groups: who enters the street together, how old they are, how fast they walk, how they stand beside each other.
 
 Sources. Sizes, speeds, places: Moussaid, Perozo, Garnier, Helbing, Theraulaz, The walking behaviour of pedestrian
 social groups and its impact on crowd dynamics, PLoS ONE 5(4): e10047, 2010: up to 70 % of people walk in groups, side
@@ -36,7 +36,7 @@ CHILDREN_SHARE, ELDERLY_SHARE = 0.10, 0.12
 """Of those whose ages nobody asked for."""
 
 
-class Company(NamedTuple):
+class PersonGroup(NamedTuple):
     """Those who enter together, one or more. ages: of each."""
 
     ages: tuple[Age, ...]
@@ -61,7 +61,7 @@ class Company(NamedTuple):
         return [(GROUP_STRIPE_M * (k - (n - 1) / 2), ROW_M * row) for row, n in enumerate(rows) for k in range(n)]
 
 
-class Companies:
+class GroupDraws:
     """Draws who comes next, so that in the long run the shares of persons are those of the spec.
 
     Half of the children's families are children: one of two; one or two of three. coming: who enters next; it stays
@@ -83,19 +83,19 @@ class Companies:
         """Who was coming is there: the next, please."""
         self.coming = self._draw()
 
-    def _draw(self) -> Company:
+    def _draw(self) -> PersonGroup:
         if self.plain:
-            return Company(self._any_ages(1))
+            return PersonGroup(self._any_ages(1))
         grouped, trio, family, second, elder = self._rng.random(5).tolist()
         size = 1 if grouped >= self._grouped else 3 if trio < TRIO_SHARE else 2
         if not self._ages:
-            return Company(self._any_ages(size))
+            return PersonGroup(self._any_ages(size))
         if size > 1 and family < self._family:
             children = size - 1 if second < 0.5 else 1
-            return Company((Age.ADULT,) * (size - children) + (Age.CHILD,) * children, SLOWEST_GROUP_MPS)
+            return PersonGroup((Age.ADULT,) * (size - children) + (Age.CHILD,) * children, SLOWEST_GROUP_MPS)
         if elder < self._elder:
-            return Company((Age.ELDERLY,) * size, SLOWEST_GROUP_MPS)
-        return Company((Age.ADULT,) * size)
+            return PersonGroup((Age.ELDERLY,) * size, SLOWEST_GROUP_MPS)
+        return PersonGroup((Age.ADULT,) * size)
 
     def _any_ages(self, size: int) -> tuple[Age, ...]:
         """How old they look where the spec asks for no ages; all walk alike."""

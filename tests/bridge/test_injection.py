@@ -21,7 +21,7 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
-from scenarios.execution.injected import MOST_GUESTS, Guests
+from scenarios.execution.injected import MOST_INJECTED, InjectedPeople
 from tests.conftest import PATIENCE_S, Cosim
 
 TICK_MS = 50
@@ -34,9 +34,9 @@ class Nobody:
         return EventReply(episode=query.episode, tick=query.tick, states=(), actors=())
 
 
-def guests(*script: Injected) -> Guests:
-    """Guests on a map that is the square of 100 m at the origin."""
-    return Guests(Nobody(), TICK_MS, lambda x, y: 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0, script)
+def injected_people(*script: Injected) -> InjectedPeople:
+    """Injected people on a map that is the square of 100 m at the origin."""
+    return InjectedPeople(Nobody(), TICK_MS, lambda x, y: 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0, script)
 
 
 def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
@@ -51,9 +51,9 @@ def anna(**fields: object) -> Injection:
     return Injection(**known | fields)  # type: ignore[arg-type]
 
 
-def test_a_guest_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
+def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> None:
     """Accepted between ticks 2 and 3 it is there at 3, 3 m at 1.5 m/s later it stands, a second later it is gone."""
-    one = guests()
+    one = injected_people()
     for tick in range(3):
         assert not one.react(query(tick)).actors
     ack = one.offer(anna(doing="look"))
@@ -69,31 +69,31 @@ def test_a_guest_enters_at_the_tick_it_was_told_walks_its_path_and_leaves() -> N
 
 def test_nobody_does_on_the_way_what_it_will_do_at_the_end() -> None:
     """Who is to sit at its end is shown to stand as it appears, and to walk; it sits where its path ends only."""
-    one = guests(Injected(tick=0, injection=anna(doing="sit")))
+    one = injected_people(Injected(tick=0, injection=anna(doing="sit")))
     shown = [actor for tick in range(60) for actor in one.react(query(tick)).actors]
     assert {actor.doing for actor in shown if actor.x_m < 13.0} == {"stand", "walk"}
     assert {actor.doing for actor in shown if actor.speed_mps == 0.0 and actor.x_m == 13.0} == {"sit"}
 
 
 @pytest.mark.parametrize("off_m", [(0.0, 0.0), (0.4, 0.3), (-0.7, 0.0), (0.7, 0.0)])
-def test_a_guest_whose_end_the_robot_stands_on_stays_beside_it(off_m: tuple[float, float]) -> None:
+def test_an_injected_person_whose_end_the_robot_stands_on_stays_beside_it(off_m: tuple[float, float]) -> None:
     """It comes within a metre, stays for its time, and is gone, instead of walking round the robot for ever."""
     end = (90.0 + off_m[0], 90.0 + off_m[1])
-    one = guests(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
+    one = injected_people(Injected(tick=0, injection=anna(path=((84.0, 90.0), end), stay_s=2.0)))
     shown = [actor for tick in range(300) for actor in one.react(query(tick)).actors]
     assert len(shown) < 240
     assert {(actor.speed_mps, actor.doing) for actor in shown[-38:]} == {(0.0, "stand")}
     assert math.dist((shown[-1].x_m, shown[-1].y_m), end) < 1.0
 
 
-def test_the_log_alone_replays_the_guests() -> None:
+def test_the_log_alone_replays_the_injected_people() -> None:
     """Two of them, injected at different ticks: a director that only has the log shows the same, tick by tick."""
-    live, shown = guests(), []
+    live, shown = injected_people(), []
     for tick in range(60):
         if tick in (4, 20):
             live.offer(anna(id=f"p{tick}"))
         shown.append(live.react(query(tick)).actors)
-    again = guests(*live.log)
+    again = injected_people(*live.log)
     assert [again.react(query(tick)).actors for tick in range(60)] == shown
     assert [entry.tick for entry in live.log] == [4, 20]
 
@@ -120,7 +120,7 @@ def test_the_log_alone_replays_the_guests() -> None:
 )  # fmt: skip
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
     """Nothing of it reaches the simulation."""
-    one = guests()
+    one = injected_people()
     ack = answer_to(message, one.offer)
     assert ack.status == "refused" and ack.tick is None and reason in ack.reason
     assert not one.react(query(0)).actors and one.log == ()
@@ -128,7 +128,7 @@ def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reaso
 
 def test_the_same_name_twice_is_refused() -> None:
     """Also when the first one is gone: the log knows everybody by name."""
-    one = guests()
+    one = injected_people()
     assert one.offer(anna()).status == "accepted"
     assert "of this id" in one.offer(anna()).reason
     for tick in range(120):
@@ -138,11 +138,11 @@ def test_the_same_name_twice_is_refused() -> None:
 
 def test_a_flood_is_bounded() -> None:
     """Of 100,000 messages so many are taken as may be there at once; the rest is told why not."""
-    one = guests()
+    one = injected_people()
     acks = [one.offer(anna(id=f"p{i}")) for i in range(100_000)]
-    assert sum(ack.status == "accepted" for ack in acks) == MOST_GUESTS
+    assert sum(ack.status == "accepted" for ack in acks) == MOST_INJECTED
     assert "are here already" in acks[-1].reason
-    assert len(one.react(query(0)).actors) == MOST_GUESTS
+    assert len(one.react(query(0)).actors) == MOST_INJECTED
 
 
 def test_those_who_enter_count_while_the_director_is_asked() -> None:
@@ -154,15 +154,15 @@ def test_those_who_enter_count_while_the_director_is_asked() -> None:
             acks.append(one.offer(anna(id="late")))
             return super().react(query)
 
-    one = Guests(Slow(), TICK_MS, lambda x, y: True)
-    assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_GUESTS))
-    assert len(one.react(query(0)).actors) == MOST_GUESTS
+    one = InjectedPeople(Slow(), TICK_MS, lambda x, y: True)
+    assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_INJECTED))
+    assert len(one.react(query(0)).actors) == MOST_INJECTED
     assert acks[0].status == "refused" and "are here already" in acks[0].reason
 
 
-def test_a_guest_does_not_walk_through_the_robot() -> None:
+def test_an_injected_person_does_not_walk_through_the_robot() -> None:
     """With the robot on its path it goes round and arrives."""
-    one = guests()
+    one = injected_people()
     one.offer(anna(path=((80.0, 90.0), (99.0, 90.0)), stay_s=60.0))
     gaps = []
     for tick in range(400):
@@ -367,10 +367,10 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, c
         assert (ack["id"] in taken_in) is (ack["status"] == "accepted"), ack
         assert ack["status"] == "accepted" or "are here already" in ack["reason"]
     assert len(said["flood"]) <= 2000 and taken_in[0] == "bob"
-    assert len(taken_in) == len(set(taken_in)) >= MOST_GUESTS
+    assert len(taken_in) == len(set(taken_in)) >= MOST_INJECTED
     assert [one["injection"]["id"] for one in said["log"]["injections"]] == taken_in
-    guests = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
-    assert MOST_GUESTS // 2 < max(guests) <= MOST_GUESTS
+    injected_people = [sum(one["kind"] == "injected" for one in crowd) for crowd in heard["crowd"]]
+    assert MOST_INJECTED // 2 < max(injected_people) <= MOST_INJECTED
     assert (
         set(heard) == {"clock", "robot", "crowd", "signals", "events"} and heard["events"][-1][-1] == "ended: failure"
     )

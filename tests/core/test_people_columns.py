@@ -10,7 +10,7 @@ from cosim.core.geometry import Pose
 from cosim.core.state import Age, People, PersonKind, RobotState, Street
 from cosim.judge.delay import Tracks
 from cosim.people.gait import Strides
-from cosim.people.neighbours import bystanders
+from cosim.people.neighbours import nearby_people
 from cosim.place.street_map import StreetMap
 from cosim.report.minimap import EVENT, Minimap
 from cosim.spec.scenario import City, Scenario
@@ -50,7 +50,7 @@ def test_columns_travel_with_their_people() -> None:
 def test_who_reads_people_reads_the_columns() -> None:
     """Bystanders, tally, delays, strides, bodies and the minimap, told of people whose names would mislead them."""
     people = STREET.people
-    assert [b.kind for b in bystanders(people)] == [PersonKind.CROWD, PersonKind.INJECTED, PersonKind.RESIDENT]
+    assert [b.kind for b in nearby_people(people)] == [PersonKind.CROWD, PersonKind.INJECTED, PersonKind.RESIDENT]
     street_map = tiny_map()
     tally = Tally(street_map, 0.05)
     tally.see(STREET)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from cosim.core.geometry import Pose
-from cosim.judge.event_monitor import in_view, unwitnessed, went_between
+from cosim.judge.event_monitor import in_view, went_between, why_invalid
 from cosim.records.record import TriggeredEvent
 from cosim.spec.events import Event, Walker
 
@@ -55,7 +55,7 @@ def test_an_event_that_nobody_saw_is_told_in_words() -> None:
     """Never triggered, never in view, or a proper event."""
     event = Event(id="e0", kind="frontal", x_m=0.0, y_m=0.0, heading_rad=0.0, route_s_m=5.0, half_width_m=1.5)
     outcome = TriggeredEvent(id="e0", kind="frontal", passed=False)
-    assert unwitnessed(event, outcome) == "event e0 (frontal) never triggered"
+    assert why_invalid(event, outcome) == "event e0 (frontal) never triggered"
     blind = TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0)
-    assert unwitnessed(event, blind) == "nobody of event e0 (frontal) was ever in view"
-    assert unwitnessed(event, TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0, seen=True)) == ""
+    assert why_invalid(event, blind) == "nobody of event e0 (frontal) was ever in view"
+    assert why_invalid(event, TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0, seen=True)) == ""

@@ -12,7 +12,7 @@ import shapely
 from cosim.core.geometry import Pose
 from cosim.core.state import STILL, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.episode.step import Step
-from cosim.judge.traffic import OnRoad, Roadway, braking_for
+from cosim.judge.traffic import OnRoad, TrafficMonitor, braking_for
 from cosim.place.street_map import Corner, Lane, Located, StreetMap, Strip
 from cosim.spec.events import EventReply
 
@@ -45,12 +45,12 @@ def test_the_carriageway_is_the_road_and_the_red_crossing(
 ) -> None:
     """On the road, on a green, a red and an unsignalised crossing, and beside the road."""
     after = street(8.0, walk)
-    assert Roadway(MAP, 0.05).see(step(0, x_m, y_m, after, after)).carriageway is on_road
+    assert TrafficMonitor(MAP, 0.05).see(step(0, x_m, y_m, after, after)).carriageway is on_road
 
 
 def test_a_vehicle_that_brakes_for_the_robot_counts_once() -> None:
     """A car that loses 3 m/s2 before a robot on the road is counted at the first tick, and anew after two seconds."""
-    roadway = Roadway(MAP, 0.05)
+    roadway = TrafficMonitor(MAP, 0.05)
     ticks = (0, 1, 2, 60)
     seen = [roadway.see(step(tick, 12.0, 0.5, street(8.0), street(7.85))) for tick in ticks]
     assert seen == [OnRoad(True, 1), OnRoad(True, 0), OnRoad(True, 0), OnRoad(True, 1)]
@@ -70,7 +70,7 @@ def test_only_hard_braking_for_the_next_in_the_way_counts() -> None:
 def test_a_green_crossing_makes_nobody_brake() -> None:
     """Cars that stop while the robot crosses at green stop for their own light; at red they stop for the robot."""
     for walk, braked in ((True, 0), (False, 1)):
-        seen = Roadway(MAP, 0.05).see(step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk)))
+        seen = TrafficMonitor(MAP, 0.05).see(step(0, 20.0, 0.5, street(8.0, walk), street(7.8, walk)))
         assert seen.braked == braked
 
 
@@ -89,7 +89,7 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
             return super().locate(x_m, y_m, slack_m)
 
     counted = Counted(**{f.name: getattr(street_map, f.name) for f in fields(street_map) if f.init})
-    kept = Roadway(counted, 0.05)
+    kept = TrafficMonitor(counted, 0.05)
     rng = np.random.default_rng(4)
     walk = np.concatenate(
         [np.column_stack([np.linspace(1.0, 15.0, 100), np.full(100, 6.0)]), rng.uniform((0, -5), (40, 9), (2000, 2))]
@@ -97,7 +97,7 @@ def test_who_stays_on_the_sidewalk_is_looked_up_once_and_seen_alike() -> None:
     for tick, (x_m, y_m) in enumerate(walk.tolist()):
         after = street(7.7, tick % 2 == 0)
         this = step(100 * tick, x_m, y_m, street(8.0, tick % 2 == 0), after)
-        assert kept.see(this) == Roadway(street_map, 0.05).see(this)
+        assert kept.see(this) == TrafficMonitor(street_map, 0.05).see(this)
         if tick == 99:
             assert len(looks) == 1
 
@@ -107,5 +107,7 @@ def test_who_waits_on_the_seam_before_a_red_crossing_is_not_on_the_road() -> Non
     seamed = replace(CROSSING, polygon=shapely.box(18.0, -4.5, 22.0, 4.5))
     street_map = StreetMap("m", MAP.bounds, {":j_c0": seamed}, {}, {}, {})
     after = street(0.0, walk=False)
-    seen = [Roadway(street_map, 0.05).see(step(0, 20.0, y_m, after, after)).carriageway for y_m in (4.3, 3.9, -4.3)]
+    seen = [
+        TrafficMonitor(street_map, 0.05).see(step(0, 20.0, y_m, after, after)).carriageway for y_m in (4.3, 3.9, -4.3)
+    ]
     assert seen == [False, True, False]

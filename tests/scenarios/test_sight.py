@@ -1,4 +1,4 @@
-"""Event pedestrians and guests among people: they see the crowd and each other, and go round them."""
+"""Event pedestrians and injected people among people: they see the crowd and each other, and go round them."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from cosim.core.state import NOBODY, People, PersonKind
-from cosim.people.neighbours import bystanders
-from cosim.spec.events import Bystander, Event, EventQuery, EventReply, EventState
+from cosim.people.neighbours import nearby_people
+from cosim.spec.events import Event, EventQuery, EventReply, EventState, NearbyPerson
 from cosim.spec.injection import Injected, Injection
 from scenarios.events import EVENT_KINDS, react
-from scenarios.events.guest import Guest, arriving, guest_actor, guest_moved_on, shown_id
+from scenarios.events.injected_person import InjectedPerson, arriving, injected_actor, injected_moved_on, shown_id
 
 TICK_MS = 50
 PEOPLE = {"conversing": 3, "queueing": 3, "ped_crossing": 4}
@@ -32,7 +32,7 @@ def asked(
     tick: int,
     x_m: float,
     v_mps: float,
-    seen: tuple[Bystander, ...],
+    seen: tuple[NearbyPerson, ...],
     events: tuple[Event, ...] = (),
     *states: EventState,
 ) -> EventQuery:
@@ -40,12 +40,12 @@ def asked(
     return EventQuery(
         episode="t", tick=tick, tick_ms=TICK_MS, robot_x_m=x_m, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=v_mps,
         robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=events, states=states,
-        bystanders=seen,
+        nearby=seen,
     )  # fmt: skip
 
 
 def drive(
-    one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: Bystander
+    one: Event, ticks: int, speed_mps: float, start_m: float, *crowd: NearbyPerson
 ) -> list[tuple[float, EventReply]]:
     """(robot x, reply) at every tick of a robot that drives along the x axis, among people who walk straight on."""
     states: tuple[EventState, ...] = ()
@@ -53,7 +53,8 @@ def drive(
     for tick in range(ticks):
         t_s = tick * TICK_MS / 1000
         here = tuple(
-            Bystander(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind) for c in crowd
+            NearbyPerson(c.id, c.x_m + c.vx_mps * t_s, c.y_m + c.vy_mps * t_s, c.vx_mps, c.vy_mps, c.kind)
+            for c in crowd
         )
         reply = react(asked(tick, start_m + speed_mps * t_s, speed_mps, here, (one,), *states))
         states = reply.states
@@ -61,10 +62,10 @@ def drive(
     return out
 
 
-def told(guest: Guest) -> Bystander:
-    """A guest as it sees others of its kind."""
-    one = guest.walker
-    return Bystander(shown_id(guest.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED)
+def told(person: InjectedPerson) -> NearbyPerson:
+    """A person as it sees others of its kind."""
+    one = person.walker
+    return NearbyPerson(shown_id(person.injection), one.x_m, one.y_m, one.vx_mps, one.vy_mps, PersonKind.INJECTED)
 
 
 def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
@@ -77,7 +78,7 @@ def gap_m(robot_x_m: float, x_m: float, y_m: float) -> float:
 def test_people_who_are_in_nobodys_way_change_nothing(kind: str) -> None:
     """To the bit: with somebody who stands off the sidewalk, and without."""
     alone = drive(event(kind), 600, 1.0, 25.0)
-    assert drive(event(kind), 600, 1.0, 25.0, Bystander("c1", 50.0, 9.0, 0.0, 0.0)) == alone
+    assert drive(event(kind), 600, 1.0, 25.0, NearbyPerson("c1", 50.0, 9.0, 0.0, 0.0)) == alone
 
 
 @pytest.mark.parametrize("side", [-1, 1])
@@ -100,7 +101,7 @@ def test_the_people_of_an_event_do_not_walk_through_each_other(kind: str, people
 def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walked_up_to() -> None:
     """`obstructing` ends in the middle of the sidewalk all the same."""
     for x_m, y_m, least in ((50.0, 0.9, 0.54), (50.0, 0.0, -1.0)):
-        track = drive(event("obstructing"), 200, 0.5, 40.0, Bystander("c1", x_m, y_m, 0.0, 0.0))
+        track = drive(event("obstructing"), 200, 0.5, 40.0, NearbyPerson("c1", x_m, y_m, 0.0, 0.0))
         ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
         assert ways[-1] == (50.0, 0.0)
         assert min(math.dist(xy, (x_m, y_m)) for xy in ways) > least
@@ -110,7 +111,7 @@ def test_who_stands_in_the_way_is_gone_round_and_who_stands_on_the_place_is_walk
 def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m: float) -> None:
     """Somebody stands on its line, somebody comes towards it: it passes both, no faster than told, and meets the robot
     that stands."""
-    crowd = (Bystander("c1", 44.0, y_m, 0.0, 0.0), Bystander("c2", 34.0, y_m, 1.1, 0.0))
+    crowd = (NearbyPerson("c1", 44.0, y_m, 0.0, 0.0), NearbyPerson("c2", 34.0, y_m, 1.1, 0.0))
     track = drive(event("frontal"), 500, 0.0, 31.0, *crowd)
     ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track if r.states[0].phase == "acting"]
     assert min(math.dist(xy, (44.0, y_m)) for xy in ways) > 0.55
@@ -122,7 +123,7 @@ def test_a_frontal_pedestrian_goes_round_people_and_still_walks_at_the_robot(y_m
 @pytest.mark.parametrize("side", [-1, 1])
 def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side: int) -> None:
     """Somebody stands on its line: it steps round, and takes aim anew at a robot that keeps its velocity."""
-    track = drive(event("lateral", side=side), 400, 0.8, 40.0, Bystander("c1", 50.1, side * 0.9, 0.0, 0.0))
+    track = drive(event("lateral", side=side), 400, 0.8, 40.0, NearbyPerson("c1", 50.1, side * 0.9, 0.0, 0.0))
     acting = [(x, r.states[0].walkers[0]) for x, r in track if r.states[0].phase == "acting"]
     assert min(math.dist((w.x_m, w.y_m), (50.1, side * 0.9)) for _, w in acting) > 0.5
     assert min(gap_m(x, w.x_m, w.y_m) for x, w in acting) < 0.02
@@ -131,53 +132,53 @@ def test_a_lateral_pedestrian_goes_round_somebody_and_still_meets_the_robot(side
 
 def test_an_overtaking_pedestrian_overtakes_people_too() -> None:
     """Behind somebody who walks slowly on its side it swerves, passes and comes in ahead of the robot."""
-    slow = Bystander("c1", 52.0, 1.6, 0.6, 0.0)
+    slow = NearbyPerson("c1", 52.0, 1.6, 0.6, 0.0)
     track = drive(event("overtaking"), 500, 1.0, 45.0, slow)
     ways = [(r.states[0].walkers[0].x_m, r.states[0].walkers[0].y_m) for _, r in track]
     assert min(math.dist(xy, (52.0 + 0.6 * 0.05 * k, 1.6)) for k, xy in enumerate(ways)) > 0.5
     assert track[-1][1].states[0].phase in ("over", "gone")
 
 
-def test_a_guest_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
+def test_an_injected_person_goes_round_people_and_ends_beside_who_stands_at_its_end() -> None:
     """On a way of 10 m somebody stands halfway, and somebody else at the end."""
-    guest = arriving(Injected(tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)))
-    standing = (Bystander("c1", 5.0, 5.0, 0.0, 0.0), Bystander("c2", 10.0, 5.0, 0.0, 0.0))
+    person = arriving(Injected(tick=0, injection=Injection(id="anna", path=((0.0, 5.0), (10.0, 5.0)), stay_s=100.0)))
+    standing = (NearbyPerson("c1", 5.0, 5.0, 0.0, 0.0), NearbyPerson("c2", 10.0, 5.0, 0.0, 0.0))
     ways = []
     for tick in range(400):
-        me = told(guest)
-        after = guest_moved_on(guest, asked(tick, 90.0, 0.0, (*standing, me)))
+        me = told(person)
+        after = injected_moved_on(person, asked(tick, 90.0, 0.0, (*standing, me)))
         assert after is not None
-        guest = after
-        ways.append((guest.walker.x_m, guest.walker.y_m))
+        person = after
+        ways.append((person.walker.x_m, person.walker.y_m))
     assert all(math.dist(xy, (c.x_m, c.y_m)) > 0.55 for xy in ways for c in standing)
-    assert guest.arrived_tick is not None and math.dist(ways[-1], (10.0, 5.0)) < 1.0
-    assert guest_actor(guest, TICK_MS).speed_mps == 0.0
+    assert person.arrived_tick is not None and math.dist(ways[-1], (10.0, 5.0)) < 1.0
+    assert injected_actor(person, TICK_MS).speed_mps == 0.0
 
 
 @pytest.mark.parametrize("names", ["ab", "ba", "abc"])
 def test_guests_who_are_injected_into_one_place_at_once_part(names: str) -> None:
     """With the same path they are not in each other after a second, nor ever again before they arrive."""
     path = ((0.0, 5.0), (10.0, 5.0))
-    guests = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
+    injected_people = [arriving(Injected(tick=0, injection=Injection(id=name, path=path))) for name in names]
     for tick in range(120):
-        seen = tuple(map(told, guests))
-        after = [guest_moved_on(guest, asked(tick, 90.0, 0.0, seen)) for guest in guests]
-        guests = [guest for guest in after if guest is not None]
-        places = [(g.walker.x_m, g.walker.y_m) for g in guests]
+        seen = tuple(map(told, injected_people))
+        after = [injected_moved_on(person, asked(tick, 90.0, 0.0, seen)) for person in injected_people]
+        injected_people = [person for person in after if person is not None]
+        places = [(g.walker.x_m, g.walker.y_m) for g in injected_people]
         gaps = [math.dist(a, b) for a, b in itertools.combinations(places, 2)]
-        assert len(guests) == len(names) and (tick < 20 or min(gaps) > 0.4)
+        assert len(injected_people) == len(names) and (tick < 20 or min(gaps) > 0.4)
 
 
 def test_the_director_is_told_of_those_near_the_people_it_moves_and_not_of_these() -> None:
-    """Of a crowd, one 3 m from an event pedestrian and a guest beside it; nobody while there is no event pedestrian."""
+    """Of a crowd, one 3 m from an event pedestrian and a person beside it; nobody while there is none."""
     ids, kind = ("u", "s", "t", "a", "r"), [0, 0, PersonKind.EVENT, PersonKind.EVENT, PersonKind.INJECTED]
     xy = [(3.0, 0.0), (9.0, 0.0), (0.0, 0.0), (0.0, 1.0), (-2.0, 0.0)]
     people = People.of(ids, xy, [math.pi / 2] * 5, [1.0, 1.0, 0.0, 0.0, 0.5], ("walk",) * 5, kind=kind)
-    told = bystanders(people)
+    told = nearby_people(people)
     assert [(b.id, b.x_m, b.y_m, b.kind) for b in told] == [("u", 3.0, 0.0, 0), ("r", -2.0, 0.0, PersonKind.INJECTED)]
     assert [(b.vx_mps, b.vy_mps) for b in told] == [pytest.approx((0.0, 1.0)), pytest.approx((0.0, 0.5))]
     crowd = People.of(ids[:2], xy[:2], [0.0] * 2, [1.0] * 2, ("walk",) * 2)
-    assert bystanders(crowd) == bystanders(NOBODY) == ()
+    assert nearby_people(crowd) == nearby_people(NOBODY) == ()
 
 
 @pytest.mark.parametrize(
@@ -193,7 +194,7 @@ def test_nobody_is_kept_from_a_place_of_the_event_for_ever(
     kind: str, people: int, side: int, standing: list[tuple[float, float]]
 ) -> None:
     """Where people stand in the way and close to the places, everybody is there within 8 s and stays."""
-    crowd = [Bystander(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
+    crowd = [NearbyPerson(f"c{k}", *xy, 0.0, 0.0) for k, xy in enumerate(standing)]
     track = drive(event(kind, people=people, side=side), 300, 0.1, 40.0, *crowd)
     late, last = track[160][1].states[0], track[-1][1].states[0]
     assert (late.phase, last.phase) == ("acting", "acting")

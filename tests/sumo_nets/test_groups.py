@@ -21,7 +21,7 @@ from scenarios.catalog import load_suite, with_crowd
 from sumo_nets.city.store import build_city
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOWEST_GROUP_MPS, Companies, Company
+from sumo_nets.crowd.group_sampling import PERSON_MPS, SLOWEST_GROUP_MPS, GroupDraws, PersonGroup
 from sumo_nets.net.netfile import read_net
 
 LINE = np.array([[0.0, 0.0], [50.0, 0.0]])
@@ -71,18 +71,18 @@ def kept(walkers: Walkers, looks: int = 2) -> dict[str, float]:
 
 def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
     """Of many persons 40 % walk in groups, 10 % are elderly, 15 % children; each child has an adult, and is slow."""
-    companies = Companies(CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1))
+    companies = GroupDraws(CrowdSpec(groups=0.4, elderly=0.1, children=0.15), np.random.default_rng(1))
     drawn = []
     for _ in range(8000):
         drawn.append(companies.coming)
         companies.entered()
-    persons = sum(company.size for company in drawn)
-    ages = Counter(age for company in drawn for age in company.ages)
+    persons = sum(group.size for group in drawn)
+    ages = Counter(age for group in drawn for age in group.ages)
     assert sum(c.size for c in drawn if c.size > 1) / persons == pytest.approx(0.4, abs=0.02)
     assert ages[Age.ELDERLY] / persons == pytest.approx(0.1, abs=0.015)
     assert ages[Age.CHILD] / persons == pytest.approx(0.15, abs=0.015)
-    assert {company.size for company in drawn} == {1, 2, 3}
-    families = [company for company in drawn if Age.CHILD in company.ages]
+    assert {group.size for group in drawn} == {1, 2, 3}
+    families = [group for group in drawn if Age.CHILD in group.ages]
     assert all(Age.ADULT in family.ages and family.pace_mps == SLOWEST_GROUP_MPS for family in families)
     assert all(c.pace_mps == PERSON_MPS for c in drawn if set(c.ages) == {Age.ADULT})
 
@@ -90,7 +90,7 @@ def test_shares_of_groups_elderly_and_children_come_out_as_asked() -> None:
 def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
     """A plain crowd takes no numbers from the generator; everybody walks alone, and some look young or old."""
     rng = np.random.default_rng(1)
-    companies = Companies(CrowdSpec(), rng)
+    companies = GroupDraws(CrowdSpec(), rng)
     ages: Counter[Age] = Counter()
     for _ in range(2000):
         (age,) = companies.coming.ages
@@ -103,7 +103,7 @@ def test_without_groups_and_ages_nothing_is_drawn_but_looks() -> None:
 
 def test_a_group_walks_abreast_where_there_is_room() -> None:
     """Three stand side by side on 1.92 m, two and one on 1.3 m, in file on 0.64 m; they walk slower than one."""
-    three = Company((Age.ADULT,) * 3)
+    three = PersonGroup((Age.ADULT,) * 3)
     assert np.array(three.places(1.92)) == pytest.approx(np.array([(-0.64, 0.0), (0.0, 0.0), (0.64, 0.0)]))
     assert np.array(three.places(1.3)) == pytest.approx(np.array([(-0.32, 0.0), (0.32, 0.0), (0.0, 0.8)]))
     assert np.array(three.places(0.64)) == pytest.approx(np.array([(0.0, 0.0), (0.0, 0.8), (0.0, 1.6)]))

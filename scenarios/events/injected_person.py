@@ -1,4 +1,4 @@
-"""A guest: an injected pedestrian that walks its path, stays at the end for its time, and is gone.
+"""A person: an injected pedestrian that walks its path, stays at the end for its time, and is gone.
 
 It goes round people and the robot; a point of its path at which somebody or the robot stands counts as reached beside
 it.
@@ -16,11 +16,11 @@ from cosim.core.state import Age, PersonKind
 from cosim.people.yielding import STEP_ROUND_GAP_M, touches
 from cosim.spec.events import GUEST, Actor, EventQuery, Walker
 from cosim.spec.injection import Injected, Injection
-from scenarios.events.sight import BESIDE_M, STILL_MPS, place_taken, sight_of_guest
+from scenarios.events.sight import BESIDE_M, STILL_MPS, place_taken, sight_of_injected
 from scenarios.events.walking import robot_of, turned, walked_to
 
 
-class Guest(NamedTuple):
+class InjectedPerson(NamedTuple):
     """Where an injected pedestrian stands. leg: the point of its path it walks to; arrived_tick: at the last one."""
 
     injection: Injection
@@ -30,28 +30,28 @@ class Guest(NamedTuple):
     moved_m: float = 0.0
 
 
-def arriving(injected: Injected) -> Guest:
-    """The guest as it appears: at the first point, facing the second."""
+def arriving(injected: Injected) -> InjectedPerson:
+    """The person as it appears: at the first point, facing the second."""
     injection = injected.injection
     (x, y), *others = injection.path
     facing = injection.heading_rad or 0.0
     if others:
         facing = math.atan2(others[0][1] - y, others[0][0] - x)
-    return Guest(injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick)
+    return InjectedPerson(injection, Walker(x_m=x, y_m=y, heading_rad=facing), 1, None if others else injected.tick)
 
 
-def guest_moved_on(guest: Guest, query: EventQuery) -> Guest | None:
+def injected_moved_on(person: InjectedPerson, query: EventQuery) -> InjectedPerson | None:
     """One tick on; None once it is gone."""
-    injection, walker = guest.injection, guest.walker
-    if guest.arrived_tick is not None:
-        if (query.tick - guest.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
+    injection, walker = person.injection, person.walker
+    if person.arrived_tick is not None:
+        if (query.tick - person.arrived_tick) * query.tick_ms / 1000 >= injection.stay_s:
             return None
         if injection.heading_rad is not None:
             heading = turned(walker.heading_rad, injection.heading_rad, query.tick_ms / 1000)
             walker = msgspec.structs.replace(walker, heading_rad=heading)
-        return guest._replace(walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0)
-    goal = injection.path[guest.leg]
-    sight = sight_of_guest(shown_id(injection), walker, query)
+        return person._replace(walker=msgspec.structs.replace(walker, vx_mps=0.0, vy_mps=0.0), moved_m=0.0)
+    goal = injection.path[person.leg]
+    sight = sight_of_injected(shown_id(injection), walker, query)
     after = walked_to(walker, *goal, injection.speed_mps, sight)
     reached = (
         (after.x_m, after.y_m) == goal or place_taken(walker, goal, sight) or _robot_stands_at(goal, walker, query)
@@ -59,9 +59,9 @@ def guest_moved_on(guest: Guest, query: EventQuery) -> Guest | None:
     vx_mps, vy_mps = ((b - a) * 1000 / query.tick_ms for a, b in ((walker.x_m, after.x_m), (walker.y_m, after.y_m)))
     after = msgspec.structs.replace(after, vx_mps=vx_mps, vy_mps=vy_mps)
     moved_m = math.hypot(after.x_m - walker.x_m, after.y_m - walker.y_m)
-    leg = guest.leg + reached
+    leg = person.leg + reached
     arrived = query.tick if leg == len(injection.path) else None
-    return guest._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
+    return person._replace(walker=after, leg=min(leg, len(injection.path) - 1), arrived_tick=arrived, moved_m=moved_m)
 
 
 def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuery) -> bool:
@@ -71,21 +71,21 @@ def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuer
 
 
 def shown_id(injection: Injection) -> str:
-    """The id under which the world shows a guest."""
+    """The id under which the world shows a person."""
     return f"{GUEST}{injection.id}"
 
 
-def guest_actor(guest: Guest, tick_ms: int) -> Actor:
-    """The guest as the world shows it; who is held up on the way stands."""
-    walker = guest.walker
-    still = "stand" if guest.arrived_tick is None else guest.injection.doing
+def injected_actor(person: InjectedPerson, tick_ms: int) -> Actor:
+    """The person as the world shows it; who is held up on the way stands."""
+    walker = person.walker
+    still = "stand" if person.arrived_tick is None else person.injection.doing
     return Actor(
-        id=shown_id(guest.injection),
+        id=shown_id(person.injection),
         x_m=walker.x_m,
         y_m=walker.y_m,
         heading_rad=walker.heading_rad,
-        speed_mps=guest.moved_m * 1000 / tick_ms,
-        doing=still if guest.moved_m < 1e-6 else "walk",
+        speed_mps=person.moved_m * 1000 / tick_ms,
+        doing=still if person.moved_m < 1e-6 else "walk",
         kind=PersonKind.INJECTED,
-        age=Age[guest.injection.age.upper()],
+        age=Age[person.injection.age.upper()],
     )
