@@ -84,6 +84,25 @@ def test_architecture_shows_the_floors_that_are_enforced() -> None:
     assert f"```\n{chr(10).join([layers[0], '', layers[1]])}\n```" in (ROOT / "ARCHITECTURE.md").read_text()
 
 
+def test_each_engine_is_imported_where_architecture_says() -> None:
+    """libsumo and zenoh in one file each, PyBullet and OpenGL in one room; the document says so in these words."""
+    where: dict[str, set[str]] = {name: set() for name in ("libsumo", "zenoh", "pybullet", "moderngl")}
+    for path in (path for room in ROOMS for path in sorted((ROOT / room).rglob("*.py"))):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            for name in where.keys() & {name.partition(".")[0] for name in names}:
+                where[name].add(path.relative_to(ROOT).as_posix())
+    assert where["libsumo"] == {"sumo_nets/engine.py"} and where["zenoh"] == {"bridge/session.py"}
+    for name in ("pybullet", "moderngl"):
+        assert where[name] and all(path.startswith("physics/") for path in where[name])
+    said = " ".join((ROOT / "ARCHITECTURE.md").read_text().split())
+    assert (
+        "libsumo is imported only in `sumo_nets/engine.py`, which types it, PyBullet and moderngl only in `physics`, "
+        "zenoh only in `bridge/session.py`" in said
+    )
+
+
 def test_architecture_tells_the_size_of_the_tiles_that_are_loaded() -> None:
     """The sentence about the ground's tiles names the size that the code has."""
     from physics.world.tiles import TILE_M

@@ -97,13 +97,13 @@ def scenario_in(size_m: float) -> Scenario:
 def _drive(size_m: float) -> Drive:
     """Drive for MEASURED_S simulated seconds in a city of a size."""
     import physics.world.profiling
-    import sumo_nets.crowd.profiling
+    import sumo_nets.engine
     from cosim.episode.loop import Parts
     from scenarios.execution.episode import Episode
 
     scenario, spent, engine = scenario_in(size_m), Spent(float), Spent(float)
     physics.world.profiling.put_physics_stopwatch(engine.timed)
-    sumo_nets.crowd.profiling.put_crowd_stopwatch(engine.timed)
+    sumo_nets.engine.put_crowd_stopwatch(engine.timed)
     policy = FourHertz()
 
     def timed(stage: StagedScenario) -> None:

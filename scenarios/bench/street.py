@@ -48,13 +48,13 @@ def time_street(rounds: int, tell: Callable[[str], None]) -> dict[int, list[Stre
 
 def street_step(persons: int) -> StreetStep:
     """Walk a robot down a long-horizon route among so many persons for a simulated minute."""
-    import sumo_nets.crowd.profiling
+    import sumo_nets.engine
     from scenarios.execution.wiring import crowd_of
 
     inside = Spent(float)
     scenario = msgspec.structs.replace(scenario_in(2000.0), crowd=CrowdSpec(persons=persons, vehicles=VEHICLES))
     line = scenario.route_line
-    sumo_nets.crowd.profiling.put_crowd_stopwatch(inside.timed)
+    sumo_nets.engine.put_crowd_stopwatch(inside.timed)
     spent_s = shown = 0.0
     with crowd_of(scenario) as crowd:
         for tick in range(WARM_UP_TICKS + MEASURED_TICKS):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,11 +18,13 @@ from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import CrowdSpec
+from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.group_cohesion import Together
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M, GroupDraws
-from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
+from sumo_nets.crowd.proxy import ROUND_THE_CORNER_M
 from sumo_nets.crowd.room import Room
 from sumo_nets.crowd.spots import EntrySpot, Spots
+from sumo_nets.engine import Sumo
 
 SIGHT_M = 35.0
 """Nobody appears nearer to the robot than this."""
@@ -74,16 +76,17 @@ class Pedestrians:
 
     def __init__(
         self,
-        engine: Any,
+        engine: Sumo,
+        entrances: Entrances,
         street_map: StreetMap,
         spec: CrowdSpec,
         rng: np.random.Generator,
         closed: frozenset[Port],
         together: Together,
     ) -> None:
-        self._engine, self._spec, self._rng, self._closed = engine, spec, rng, closed
+        self._engine, self._entrances, self._spec, self._rng, self._closed = engine, entrances, spec, rng, closed
         self._together = together
-        self.ages: dict[str, Age] = {}
+        self.ages = entrances.ages
         self._graph = WalkGraph(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
         self._spots = Spots(
@@ -142,6 +145,7 @@ class Pedestrians:
         """Take somebody who is still there out, with all who walk along."""
         if name in self._engine.person.getIDList():
             for fellow in self._together.leave(name):
+                self._entrances.people[self._engine.simulation.getTime()].append(fellow)
                 self._engine.person.remove(fellow)
 
     def _margin_m(self, port: Port) -> float:
@@ -197,18 +201,25 @@ class Pedestrians:
         return name
 
     def _add(self, name: str, spot: EntrySpot, walk: list[str], speed_mps: float, xy: tuple[float, float]) -> None:
-        """SUMO lets everybody enter on the right edge of the way; the move spreads them over its width."""
         first_m, last_m = (self._engine.lane.getLength(f"{edge}_0") for edge in (walk[0], walk[-1]))
-        self._engine.person.add(name, spot.edge, spot.share * first_m)
-        self._engine.person.appendWalkingStage(name, walk, last_m / 2, speed=speed_mps)
-        self._engine.person.moveToXY(name, "", *xy, heading_to_sumo(spot.pose.heading_rad), KEEP_ROUTE, MATCH_M)
+        angle_deg = heading_to_sumo(spot.pose.heading_rad)
+        entry = PersonEntry(name, spot.edge, spot.share * first_m, tuple(walk), last_m / 2, speed_mps, xy, angle_deg)
+        self._entrances.people[self._engine.simulation.getTime()].append(entry)
+        entry.enter(self._engine)
 
 
 class Drivers:
     """The vehicles."""
 
-    def __init__(self, engine: Any, street_map: StreetMap, spec: CrowdSpec, rng: np.random.Generator) -> None:
-        self._engine, self._spec, self._rng = engine, spec, rng
+    def __init__(
+        self,
+        engine: Sumo,
+        entrances: Entrances,
+        street_map: StreetMap,
+        spec: CrowdSpec,
+        rng: np.random.Generator,
+    ) -> None:
+        self._engine, self._entrances, self._spec, self._rng = engine, entrances, spec, rng
         lanes = [lane for lane in street_map.lanes.values() if lane.kind == "road" and not lane.internal]
         self._lanes: dict[str, list[str]] = {}
         lines: dict[str, Floats] = {}
@@ -245,6 +256,7 @@ class Drivers:
             if here is None or (
                 here.waiting_s > VEHICLE_STUCK_S and np.hypot(here.x_m - x_m, here.y_m - y_m) > VEHICLE_RING_M[0]
             ):
+                self._entrances.vehicles[self._engine.simulation.getTime()].append(name)
                 vehicle.remove(name)
                 self._size.pop(name)
             else:
@@ -264,8 +276,9 @@ class Drivers:
         name = f"v{self._count}"
         self._count += 1
         position_m = spot.share * self._engine.lane.getLength(self._lanes[spot.edge][0])
-        self._engine.route.add(name, route)
-        self._engine.vehicle.add(name, name, typeID=kind, departLane="best", departPos=f"{position_m:.2f}")
+        entry = VehicleEntry(name, kind, tuple(route), position_m)
+        self._entrances.vehicles[self._engine.simulation.getTime()].append(entry)
+        entry.enter(self._engine)
         self._size[name] = VEHICLE_TYPES[kind][:2]
 
     def _route(self, edge: str) -> list[str]:

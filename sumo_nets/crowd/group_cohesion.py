@@ -12,7 +12,7 @@ import itertools
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Final
+from typing import Final, Protocol
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from cosim.core.geometry import heading_to_sumo
 from cosim.place.street_map import Strip
 from sumo_nets.crowd.group_sampling import PERSON_MPS
 from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M, ROUND_THE_CORNER_M
+from sumo_nets.engine import Sumo
 
 _SLACK_M: Final = 0.15
 """Nobody cares to be so little ahead or behind."""
@@ -75,13 +76,22 @@ class _Group:
     share: dict[str, float] = field(default_factory=dict)
 
 
+class _Standing(Protocol):
+    """Where somebody is."""
+
+    @property
+    def x_m(self) -> float: ...
+    @property
+    def y_m(self) -> float: ...
+
+
 class Together:
-    """The groups on the street. engine: libsumo.
+    """The groups on the street.
 
     strips: the sidewalks and crossings. tick_s: a step of SUMO.
     """
 
-    def __init__(self, engine: Any, strips: Mapping[str, Strip], tick_s: float) -> None:
+    def __init__(self, engine: Sumo, strips: Mapping[str, Strip], tick_s: float) -> None:
         self._engine, self._strips, self._tick_s = engine, strips, tick_s
         self._groups: dict[str, _Group] = {}
         self._chords: dict[str, _Place] = {}
@@ -120,7 +130,7 @@ class Together:
             self._groups.pop(fellow, None)
         return names
 
-    def keep(self, seen: Mapping[str, Any]) -> None:
+    def keep(self, seen: Mapping[str, _Standing]) -> None:
         """Everybody's speed for the time until the next look. seen: where (x_m, y_m) people are."""
         for name, group in self._groups.items():
             if name == group.names[0] and all(fellow in seen for fellow in group.names):
@@ -146,7 +156,7 @@ class Together:
                 share = 1.0
             self._walk(group, name, round(_STEPS * share) / _STEPS)
 
-    def _close(self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, Any]) -> None:
+    def _close(self, here: Mapping[str, _Place], group: _Group, way: _Place, seen: Mapping[str, _Standing]) -> None:
         """Let one who walks too far to the side, and did before, step nearer to its fellows; of two the hindmost."""
         left = sorted((way[0] * y_m - way[1] * x_m, name) for name, (x_m, y_m) in here.items())
         too_wide = [

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from cosim.core.state import Signal
 from cosim.place.street_map import StreetMap
+from sumo_nets.engine import Sumo
 
 _NEAR_M = 80.0
 """The signals of crossings within this distance of the robot are shown."""
@@ -24,7 +24,7 @@ _WALK = "Gg"
 class Signals:
     """Every signalised crossing's link; programs are read once, states once per switch."""
 
-    def __init__(self, engine: Any, street_map: StreetMap) -> None:
+    def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
         self._engine = engine
         self._link: dict[str, tuple[str, int]] = {}
         for light in sorted(engine.trafficlight.getIDList()):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -19,6 +19,7 @@ from shapely.geometry import LineString
 
 from cosim.core.geometry import Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
+from sumo_nets.engine import Sumo
 
 KEEP_ROUTE = 3
 """moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""
@@ -52,7 +53,7 @@ class Walks:
     where there is no corner. Sidewalks of one junction that do not meet make a walk that crashes SUMO.
     """
 
-    def __init__(self, engine: Any, street_map: StreetMap) -> None:
+    def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
         self.street_map = street_map
         self._place = _meeting_places(street_map)
         self._ends: dict[str, tuple[str, str]] = {}
@@ -167,7 +168,7 @@ class Walks:
 class Proxy:
     """The stand-in of one body. `base` starts the names of the SUMO persons it uses, one after another."""
 
-    def __init__(self, engine: Any, walks: Walks, *, base: str, kind: str, serial: Iterator[int]) -> None:
+    def __init__(self, engine: Sumo, walks: Walks, *, base: str, kind: str, serial: Iterator[int]) -> None:
         self._engine = engine
         self._walks = walks
         self._base, self._kind, self._serial = base, kind, serial
@@ -241,7 +242,7 @@ def _inner_pieces(edges: Iterable[str]) -> dict[str, list[str]]:
     return inner
 
 
-def _line(engine: Any, edge: str) -> shapely.Geometry:
+def _line(engine: Sumo, edge: str) -> shapely.Geometry:
     """What SUMO measures distances to: the middle line of an edge, the outline, left open, of a walking area."""
     return LineString([point[:2] for point in engine.lane.getShape(f"{edge}_0")])
 

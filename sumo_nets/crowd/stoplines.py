@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from typing import NamedTuple
 
-import libsumo
+from sumo_nets.engine import sumo
 
 
 class Passed(NamedTuple):
@@ -29,7 +29,7 @@ class StopLines:
         """The vehicles that have driven over a stop line since the last call, with what the light shows now."""
         ahead = {}
         for name in vehicles:
-            lights = libsumo.vehicle.getNextTLS(name)
+            lights = sumo.vehicle.getNextTLS(name)
             if lights:
                 ahead[name] = lights[0][:3]
         lit = {
@@ -49,5 +49,4 @@ class StopLines:
 
 
 def _letter(link: tuple[str, int]) -> str:
-    state: str = libsumo.trafficlight.getRedYellowGreenState(link[0])
-    return state[link[1]]
+    return sumo.trafficlight.getRedYellowGreenState(link[0])[link[1]]
