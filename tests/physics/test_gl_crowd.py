@@ -96,7 +96,8 @@ def test_each_level_is_like_full_detail_where_it_begins(
     taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
     changed = total = 0
     for i in range(24):
-        people = People.of((f"c{i}",), [[0.0, 0.0]], [1.7 * i], [1.3 * (i % 3 > 0)], ("stand",), [0.37 * i])
+        age = (Age.ADULT, Age.ADULT, Age.CHILD, Age.ELDERLY)[i % 4]
+        people = People.of((f"c{i}",), [[0.0, 0.0]], [1.7 * i], [1.3 * (i % 3 > 0)], ("stand",), [0.37 * i], age=age)
         shown = []
         for forced in (level, 0):
             monkeypatch.setattr(crowds, "levels", lambda xy, z_m, taken, k=forced: np.full(len(xy), k))

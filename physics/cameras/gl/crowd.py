@@ -26,7 +26,7 @@ from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
 
-LEVEL_PX: Final = (170.0, 60.0, 22.0)
+LEVEL_PX: Final = (170.0, 56.0, 22.0)
 """Drawn height of a body, in pixels, below which the next coarser level is taken."""
 
 _INSTANCE: Final = np.dtype([("person", "i4"), ("girth", "f4")])
