@@ -128,16 +128,14 @@ class People:
         """Those in these rows."""
         if len(rows) == len(self.ids) and (rows == np.arange(len(rows))).all():
             return self
+        columns = (self.xy, self.heading, self.speed, self.strides, self.pace, self.kind, self.age)
+        arrays: list[Any] = [column[rows] for column in columns]
+        for array in arrays:
+            array.flags.writeable = False
+        xy, heading, speed, strides, pace, kind, age = arrays
         chosen = rows.tolist()
-
-        def part(column: Any) -> Any:
-            if isinstance(column, tuple):
-                return tuple([column[i] for i in chosen])
-            taken = column[rows]
-            taken.flags.writeable = False
-            return taken
-
-        return People(*(part(getattr(self, column.name)) for column in fields(self)))
+        ids, doing = tuple([self.ids[i] for i in chosen]), tuple([self.doing[i] for i in chosen])
+        return People(ids, xy, heading, speed, doing, strides, pace, kind, age)
 
     def __len__(self) -> int:
         return len(self.ids)
