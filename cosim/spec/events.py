@@ -38,7 +38,7 @@ class Event(Ranged, frozen=True, kw_only=True):
     speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
     hold_s: Annotated[float, Within(0, 3600)] = 20.0
     side: Literal[-1, 1] = 1
-    people: int = 1
+    people: Annotated[int, Within(0, 100)] = 1
     half_length_m: Annotated[float, Within(0, 50)] = 0.0
 
     @property

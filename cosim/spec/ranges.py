@@ -139,7 +139,7 @@ def rules_of(kind: type[Ranged]) -> tuple[tuple[str, Rule], ...]:
 
 def refusal_of(field: str, rule: Rule, value: Any) -> str:
     """What a rule says of the value of a field; nothing where none is given."""
-    return "" if value is None or value is msgspec.UNSET else rule.refusal(field, value)
+    return "" if value is None else rule.refusal(field, value)
 
 
 def shown(value: object) -> str:

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from functools import cached_property
 from itertools import chain
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Literal
 
 import msgspec
@@ -38,37 +37,20 @@ _NAME = Text(200)
 FOLDER = Named("a folder")
 
 
-class _Uneven(Ranged, frozen=True, kw_only=True):
-    """A place whose ground may be uneven. roughness: from 0 (flat) to 1; a spec of flat ground does not mention it,
-    so that it keeps the hash it had before there was uneven ground."""
-
-    roughness: Annotated[
-        float | msgspec.UnsetType, Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
-    ] = msgspec.UNSET
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.roughness == 0.0:
-            msgspec.structs.force_setattr(self, "roughness", msgspec.UNSET)
-
-    @property
-    def unevenness(self) -> float:
-        """The roughness of the ground, 0 where the spec does not mention it."""
-        return 0.0 if isinstance(self.roughness, msgspec.UnsetType) else self.roughness
-
-
+_ROUGHNESS = Within(0, 1, words="is {value:g}, but it lies between 0 (flat) and 1")
 CITY_SIZE_M = Within(200, 4000)
 """In a smaller square there is no room for two blocks."""
 
 
-class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
+class City(Ranged, frozen=True, kw_only=True, tag="city", tag_field="kind"):
     """A procedural city. size_m: in whole centimetres. net_hash: content hash of the street net the scenario was made
-    on."""
+    on. roughness: of the ground, from 0 (flat) to 1."""
 
     seed: Annotated[int, SEED]
     size_m: Annotated[float, CITY_SIZE_M] = 2000.0
     style: Annotated[str, Named("a style")] = "mixed"
     net_hash: Annotated[str, _NAME] = ""
+    roughness: Annotated[float, _ROUGHNESS] = 0.0
 
     def contradictions(self) -> Iterator[str]:
         if round(self.size_m, 2) != self.size_m:
@@ -79,12 +61,14 @@ class City(_Uneven, frozen=True, kw_only=True, tag="city", tag_field="kind"):
         return f"city-{self.style}-{self.size_m:g}m-{self.seed}"
 
 
-class CityMap(_Uneven, frozen=True, kw_only=True, tag="map", tag_field="kind"):
-    """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props)."""
+class CityMap(Ranged, frozen=True, kw_only=True, tag="map", tag_field="kind"):
+    """An imported map, by its name in the store of maps. seed: of what the map does not say (buildings, props).
+    roughness: of the ground, from 0 (flat) to 1."""
 
     map: Annotated[str, _NAME]
     seed: Annotated[int, SEED] = 0
     net_hash: Annotated[str, _NAME] = ""
+    roughness: Annotated[float, _ROUGHNESS] = 0.0
 
     @property
     def name(self) -> str:
@@ -148,9 +132,9 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     radius_m: Annotated[float, Within(20, 500)] = 80.0
     vehicles: Annotated[int, Within(0, 200)] = 20
     density: Annotated[
-        float | msgspec.UnsetType,
+        float | None,
         Within(0, MOST_PER_1000_M2, words="must be in {range} per 1000 m2, not {value}"),
-    ] = msgspec.UNSET
+    ] = None
     residents: Annotated[int, Within(0, 60)] = 0
     groups: Annotated[float, SHARE] = 0.0
     elderly: Annotated[float, SHARE] = 0.0
@@ -171,11 +155,11 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
                 f"crowd elderly must be in [0, 1 - 2 children] = [0, {1.0 - 2.0 * self.children:g}], "
                 f"not {self.elderly}: children walk with adults who are not elderly"
             )
-        if not isinstance(self.density, msgspec.UnsetType) and self.persons != DEFAULT_PERSONS:
+        if self.density is not None and self.persons != DEFAULT_PERSONS:
             yield f"crowd: give persons ({self.persons}) or density ({self.density:g}), not both"
 
 
-class Light(Ranged, frozen=True, kw_only=True, omit_defaults=True):
+class Light(Ranged, frozen=True, kw_only=True):
     """Time of day and weather of a scenario: what they do to pictures, and to nothing else.
 
     hour: solar time, the sun highest at 12. cloud_cover: 0 (clear) to 1 (overcast). fog_m: the distance at which fog
@@ -300,24 +284,8 @@ def content_hash(spec: msgspec.Struct) -> str:
     return hashlib.sha256(_canonical(spec)).hexdigest()[:16]
 
 
-ADDED: Mapping[str, object] = MappingProxyType(
-    {
-        "light": {}, "ends_at": "goal", "people": 1, "half_length_m": 0.0, "residents": 0,
-        "groups": 0.0, "elderly": 0.0, "children": 0.0,
-    }
-)  # fmt: skip
-"""Fields that came later, with the values that mean what was meant before there were such fields."""
-
-
 def _canonical(spec: msgspec.Struct) -> bytes:
-    """JSON of a spec. What was ADDED is left out of scenarios, crowds and events where it says nothing new, so that a
-    spec has the bytes and the hash it had before."""
-    tree = msgspec.to_builtins(spec, order="deterministic")
-    for scenario in tree.get("scenarios", [tree]):
-        for part in (scenario, scenario.get("crowd", {}), *scenario.get("events", ())):
-            for field in [name for name, before in ADDED.items() if part.get(name) == before]:
-                del part[field]
-    return msgspec.json.encode(tree)
+    return msgspec.json.encode(spec, order="deterministic")
 
 
 def event_faults(scenario: Scenario, kinds: EventKinds, place: str = "$") -> Iterator[str]:

@@ -7,7 +7,6 @@ from typing import Final
 
 import numpy as np
 import shapely
-from msgspec import UnsetType
 from shapely.geometry import LineString, Point
 
 from cosim.core.errors import MapError, SpecError, UsageError
@@ -122,7 +121,7 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
     """Crowds that by their density are more people than one may ask for by number."""
     crowd = scenario.crowd
-    if not isinstance(crowd.density, UnsetType):
+    if crowd.density is not None:
         room_m2 = Room(street_map, crowd.radius_m).area_m2(*scenario.start[:2])
         if (persons := round(crowd.density * room_m2 / 1000.0)) > MOST_PERSONS:
             yield (

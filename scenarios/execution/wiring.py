@@ -75,7 +75,7 @@ def staged(
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     walkable = street_map.walkable_near(around)
     with ExitStack() as stack:
-        street = StreetSurface(street_map, scenario.place.seed, scenario.place.unevenness)
+        street = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
         robot = robot_called(scenario.robot)
         world = stack.enter_context(world_of(street, scenario.barriers, robot))
         crowd = stack.enter_context(crowd_of(scenario))

@@ -24,7 +24,7 @@ def export_street(scenario: Scenario, path: Path, tell: Tell = untold) -> int:
     the map's x and y, in metres. Raises MachineError when it cannot be written."""
     tell(f"reading the street map of {scenario.place.name}")
     _, street_map = place(scenario.place)
-    surface = StreetSurface(street_map, scenario.place.seed, scenario.place.unevenness)
+    surface = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
     keys = keys_in(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
     written = as_gltf(surface, keys, scenario.barriers, tell)
     try:

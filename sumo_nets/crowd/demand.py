@@ -10,7 +10,6 @@ import math
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 
 from cosim.core.geometry import Floats, heading_to_sumo
@@ -106,7 +105,7 @@ class Pedestrians:
 
     def wanted(self, x_m: float, y_m: float) -> int:
         """How many persons there should be within the crowd's radius of a point."""
-        if isinstance(self._spec.density, msgspec.UnsetType):
+        if self._spec.density is None:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
@@ -131,7 +130,7 @@ class Pedestrians:
         inside = [name for name, far_m in away_m.items() if far_m < radius_m]
         low_m = min(max(SIGHT_M, radius_m - ENTER_M), radius_m - 10.0)
         missing = self.wanted(x_m, y_m) - len(inside)
-        if not isinstance(self._spec.density, msgspec.UnsetType):
+        if self._spec.density is not None:
             far = sorted((name for name in inside if away_m[name] > low_m), key=lambda name: (-away_m[name], name))
             spare = -missing - (0 if self._groups.plain else 1)
             for name in far:

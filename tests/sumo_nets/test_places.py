@@ -83,7 +83,7 @@ def test_the_folder_of_a_city_is_that_city(city: Path) -> None:
     """It is the same place as by its seed, with the hash of its net, so that a run of it needs no folder."""
     where = place_called(str(city), roughness=0.2)
     assert where == place_called(str(city / NET_NAME), roughness=0.2)
-    assert isinstance(where, City) and (where.seed, where.size_m, where.unevenness) == (7, 400.0, 0.2)
+    assert isinstance(where, City) and (where.seed, where.size_m, where.roughness) == (7, 400.0, 0.2)
     for kind in ("long-horizon", "reactive"):
         one, again = (suite_on_map(kind, str(city), 3, 2) for _ in range(2))
         assert one == again and len(one.scenarios) == 2
