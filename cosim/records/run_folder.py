@@ -188,12 +188,13 @@ class RunFolder:
 
     def forget(self, scenario_id: str) -> None:
         """Remove what an earlier attempt at a scenario has left."""
-        path = self.episode_folder(scenario_id) / "record.json"
-        shutil.rmtree(path.with_name("frames"), ignore_errors=True)
+        folder = self.episode_folder(scenario_id)
+        shutil.rmtree(folder / "frames", ignore_errors=True)
         try:
-            path.unlink(missing_ok=True)
+            for name in ("record.json", "trajectory.npz", "record.json.part", "trajectory.npz.part"):
+                (folder / name).unlink(missing_ok=True)
         except OSError as error:
-            raise unwritable(path, error) from error
+            raise unwritable(folder, error) from error
 
     def finish(self) -> pd.DataFrame:
         """Write results.csv and return its table."""

@@ -232,6 +232,18 @@ def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
         assert len(again.notes) == 2 and all(note.endswith("This episode is run again.") for note in again.notes)
 
 
+def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> None:
+    """A run killed after it wrote a trajectory and before the record: the next attempt begins with an empty folder."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
+        folder.keep_frame("s-0", 4, b"png")
+        for name in ("trajectory.npz", "trajectory.npz.part", "record.json.part"):
+            (folder.episode_folder("s-0") / name).write_bytes(b"of the first attempt")
+    with RunFolder.resume(tmp_path / "run", SPEC) as again:
+        again.forget("s-0")
+        again.keep(record("s-0", status="crashed"))
+        assert [path.name for path in again.episode_folder("s-0").iterdir()] == ["record.json"]
+
+
 def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
     """A record on disk without a row counts as finished when the run is resumed; one with a row stays as it was."""
     folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
