@@ -9,9 +9,10 @@ from __future__ import annotations
 
 from typing import Protocol
 
+from cosim.core.errors import MachineError
 from cosim.episode.driver import Driver
 from scenarios.execution.asked import Question
-from scenarios.execution.messages import Hear, Hello, Job
+from scenarios.execution.messages import Hear, Hello, Job, Message
 from scenarios.execution.worker import run_job
 
 
@@ -84,8 +85,21 @@ class _Here:
 
     def listen(self, hear: Hear) -> bool:
         job, self._job = self._job, None
-        if job is not None:
-            hear(run_job(job, self._driver, hear)[0])
+        if job is None:
+            return True
+        refused: list[MachineError] = []
+
+        def say(message: Message) -> None:
+            try:
+                hear(message)
+            except MachineError as error:
+                refused.append(error)
+                raise
+
+        done, _ = run_job(job, self._driver, say)
+        if refused:  # the run's own trouble, such as a full disk, is no crash of the episode
+            raise refused[0]
+        hear(done)
         return True
 
     def hang_up(self) -> None:

@@ -65,7 +65,6 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
         driver = driver or _loaded(hello, timer, say)
         done, trouble = run_job(job, driver, say)
         if trouble:
-            print(f"--- {job.scenario.id}\n{trouble}", file=sys.stderr, flush=True)
             driver = None  # made anew for the next one
         say(done)
 
@@ -96,8 +95,9 @@ def _loaded(hello: Hello, timer: Asked, say: Hear) -> Driver:
     return driver
 
 
-def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done, str]:
-    """Run one episode and tell how it goes. Returns what came out, and its traceback; "" if nothing went wrong."""
+def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done, bool]:
+    """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
+    printed, because a record holds the message alone."""
     from scenarios.execution.run import run_episode
 
     name = job.scenario.id
@@ -109,8 +109,10 @@ def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done, str]:
         waiting=lambda reason: say(Waits(name, reason)),
         comparing=lambda share: say(Compares(name, share)),
     )
+    if outcome.traceback:
+        print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
     log = b"" if outcome.log is None else outcome.log.encoded()
-    return Done(name, outcome.record.status, outcome.record.encoded(), log), outcome.traceback
+    return Done(name, outcome.record.status, outcome.record.encoded(), log), bool(outcome.traceback)
 
 
 def _watcher(job: Job, say: Hear) -> Watch:

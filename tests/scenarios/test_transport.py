@@ -8,14 +8,17 @@ import msgspec
 import pytest
 
 import cosim
+from cosim.core.errors import MachineError
 from cosim.core.state import Command
+from cosim.episode.driver import Driver
 from cosim.episode.log import Log
-from cosim.episode.ports import CameraSpec, Manifest
+from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.records.run_folder import read_records
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Suite
 from scenarios.checks import small_scenario
 from scenarios.execution import suite_run
+from scenarios.execution.messages import Done, Hear, Hello, Job, Message
 from scenarios.execution.process import LocalProcesses
 from scenarios.execution.transport import InProcess
 
@@ -30,6 +33,45 @@ class Ahead:
 
     def act(self, observation: object) -> Command:
         return Command(0.8, 0.0)
+
+
+class Fails(Ahead):
+    """Raises."""
+
+    def act(self, observation: object) -> Command:
+        raise LookupError("no answer")
+
+
+def done_here(policy: Policy, hear: Hear) -> None:
+    """One short scenario in this process."""
+    driver = Driver.of(policy)
+    worker = InProcess(driver).start(Hello("mine", driver.manifest, driver.source_hash))
+    worker.give(Job(msgspec.structs.replace(small_scenario(), time_limit_s=1.0)))
+    assert worker.listen(hear)
+
+
+@pytest.mark.engine
+def test_a_full_disk_is_no_crash_of_an_episode_in_this_process(tmp_path: Path) -> None:
+    """What the run cannot write while the episode goes on ends the run, as it does with processes."""
+    told: list[Message] = []
+
+    def hear(message: Message) -> None:
+        told.append(message)
+        raise MachineError("cannot be written: no space left on device")
+
+    with pytest.raises(MachineError, match="no space left"):
+        done_here(Ahead(), hear)
+    assert len(told) == 1 and not isinstance(told[0], Done)
+
+
+@pytest.mark.engine
+def test_the_traceback_of_a_crash_is_printed_in_this_process(capfd: pytest.CaptureFixture[str]) -> None:
+    """A record holds the message alone; the lines that lead to it are printed, as in a worker's log."""
+    told: list[Message] = []
+    done_here(Fails(), told.append)
+    assert isinstance(done := told[-1], Done) and done.status == "crashed" and b"no answer" in done.record
+    said = capfd.readouterr().err
+    assert said.startswith("--- ") and 'raise LookupError("no answer")' in said
 
 
 @pytest.mark.engine
