@@ -30,7 +30,7 @@ _FOLDER: Final = "baked"
 _SEAL: Final = "seal.json"
 _LEFT_OVER_S: Final = 3600.0
 """A folder in the making that is older than this belongs to a process that was killed."""
-_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet")
+_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy")
 """Packages that what is baked depends on."""
 
 
@@ -39,12 +39,22 @@ def cache_folder() -> Path:
     return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
-def baked(name: str, rooms: tuple[Path, ...], make: Callable[[], Arrays]) -> Arrays:
+def sources_hash(*rooms: Path) -> str:
+    """16 hex digits of the sources in some folders and of the libraries. To be asked for when those are imported: who
+    edits them later does not change what this process makes."""
+    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
+    for room in rooms:
+        for source in sorted(room.rglob("*.py")):
+            seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
+    return seen.hexdigest()[:16]
+
+
+def baked(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
     """What `make` makes, write-protected: from the cache, else made now and kept.
 
-    name: of the file name, with everything `make` was told; rooms: the folders of the sources it is made by.
+    name: of the file name, with everything `make` was told; made_by: the `sources_hash` of what it is made by.
     """
-    folder = cache_folder() / _FOLDER / f"{name}-{_made_by(rooms)}"
+    folder = cache_folder() / _FOLDER / f"{name}-{made_by}"
     with suppress(OSError, ValueError, msgspec.DecodeError):
         return _read(folder)
     arrays = {key: np.ascontiguousarray(array) for key, array in make().items()}
@@ -101,16 +111,6 @@ def _clear(parent: Path) -> None:
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > _LEFT_OVER_S:
                 shutil.rmtree(left, ignore_errors=True)
-
-
-@cache
-def _made_by(rooms: tuple[Path, ...]) -> str:
-    """16 hex digits of the sources in some folders and of the libraries."""
-    seen = hashlib.sha256(" ".join(version(package) for package in _MADE_WITH).encode())
-    for room in rooms:
-        for source in sorted(room.rglob("*.py")):
-            seen.update(source.relative_to(room).as_posix().encode() + b"\0" + source.read_bytes())
-    return seen.hexdigest()[:16]
 
 
 @cache

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import Arrays, baked
+from cosim.core.baked import Arrays, baked, sources_hash
 from cosim.core.geometry import Floats
 from cosim.people.gait import PACES_MPS
 from physics.people.families import FAMILIES, Family, skeleton
@@ -24,7 +24,7 @@ from physics.people.skeleton import Skeleton, forward, model_pose, skinning
 
 STOOP_RAD: Final[Mapping[Family, float]] = MappingProxyType({"man": 0.0, "woman": 0.0, "child": 0.0, "elder": 0.34})
 """How far the back is bent."""
-_SOURCES: Final = (Path(__file__).parent, Path(__file__).parents[2] / "cosim/people")
+_MADE_BY: Final = sources_hash(Path(__file__).parent, Path(__file__).parents[2] / "cosim/people")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Clips:
 @lru_cache(maxsize=1)
 def own_clips() -> Clips:
     """The motions of our own bodies."""
-    arrays = baked("clips", _SOURCES, _made)
+    arrays = baked("clips", _MADE_BY, _made)
     return Clips(arrays["matrices"], arrays["gaits"], {name: arrays[name] for name in GESTURES})
 
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.baked import Arrays, baked
+from cosim.core.baked import Arrays, baked, sources_hash
 from cosim.core.errors import SpecError, UsageError, unknown
 from physics.textures.noise import Field, Noise
 
@@ -29,6 +29,7 @@ Rgb = NDArray[np.floating[Any]]
 Colour = tuple[float, float, float]
 
 SIZES: Final = (256, 512, 1024)
+_MADE_BY: Final = sources_hash(Path(__file__).parent)
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +84,7 @@ def stacked(kind: str, recipes: Mapping[str, Recipe], size_px: int, seed: int) -
     """
     if size_px not in SIZES:
         raise SpecError(f"a texture's size_px must be one of {', '.join(map(str, SIZES))}, not {size_px}")
-    arrays = baked(f"{kind}-{size_px}-{seed}", (Path(__file__).parent,), lambda: _made(recipes, size_px, seed))
+    arrays = baked(f"{kind}-{size_px}-{seed}", _MADE_BY, lambda: _made(recipes, size_px, seed))
     metres = np.array([np.broadcast_to(recipe.metres, 2) for recipe in recipes.values()], np.float32)
     metres.flags.writeable = False
     return Layers(tuple(recipes), arrays["rgba"], metres, arrays["mean"], arrays.get("finish"))

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
+from importlib.metadata import packages_distributions
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from cosim.core import baked as module
-from cosim.core.baked import Arrays, baked
-from tests.conftest import PATIENCE_S
+from cosim.core.baked import Arrays, baked, sources_hash
+from tests.conftest import PATIENCE_S, ROOT
 
 WANTED = {"ramp": np.arange(1000.0).reshape(10, 100), "bytes": np.arange(256, dtype=np.uint8)}
 
@@ -31,7 +33,6 @@ class Maker:
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of sources, and a cache of its own."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
-    module._made_by.cache_clear()
     module._say_once.cache_clear()
     (tmp_path / "room").mkdir()
     (tmp_path / "room" / "maker.py").write_text("version = 1\n")
@@ -45,26 +46,46 @@ def same(arrays: Arrays) -> bool:
 def test_what_was_made_is_made_once_and_mapped_into_memory(room: Path) -> None:
     """The second asking gives the same arrays out of the file, write-protected."""
     make = Maker()
-    assert same(baked("a", (room,), make)) and same(again := baked("a", (room,), make)) and make.times == 1
+    first, again = (baked("a", sources_hash(room), make) for _ in range(2))
+    assert same(first) and same(again) and make.times == 1
     assert all(isinstance(array, np.memmap) and not array.flags.writeable for array in again.values())
 
 
 def test_other_sources_and_other_names_make_anew(room: Path) -> None:
     """What is kept of another source, or under another name, is not taken."""
     make = Maker()
-    baked("a", (room,), make)
-    baked("b", (room,), make)
+    baked("a", sources_hash(room), make)
+    baked("b", sources_hash(room), make)
     (room / "maker.py").write_text("version = 2\n")
-    module._made_by.cache_clear()
-    baked("a", (room,), make)
+    baked("a", sources_hash(room), make)
     assert make.times == 3
+
+
+def test_sources_edited_under_a_running_process_do_not_get_what_it_makes(room: Path) -> None:
+    """A process names what it makes by the sources it has imported; who imports the edited ones makes anew."""
+    make, imported = Maker(), sources_hash(room)
+    (room / "maker.py").write_text("version = 2\n")
+    baked("a", imported, make)
+    baked("a", sources_hash(room), make)
+    assert make.times == 2
+
+
+def test_a_name_tells_every_package_that_what_is_kept_stands_on() -> None:
+    """What the rooms of textures and motions import of others is in the list."""
+    rooms = [ROOT / room for room in ("physics/textures", "physics/people", "cosim/people")]
+    trees = [ast.parse(path.read_text()) for room in rooms for path in room.rglob("*.py")]
+    nodes = [node for tree in trees for node in ast.walk(tree)]
+    froms = {node.module or "" for node in nodes if isinstance(node, ast.ImportFrom)}
+    plain = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    tops = {name.partition(".")[0] for name in froms | plain} - sys.stdlib_module_names - {"cosim", "physics"}
+    assert {package for top in tops for package in packages_distributions()[top]} <= set(module._MADE_WITH)
 
 
 @pytest.mark.parametrize("damage", ["a bit", "cut off", "no seal", "no array", "not JSON"])
 def test_damage_is_made_anew(room: Path, tmp_path: Path, damage: str) -> None:
     """Whatever became of the files, the arrays are right, and whole again afterwards."""
     make = Maker()
-    baked("a", (room,), make)
+    baked("a", sources_hash(room), make)
     (folder,) = (tmp_path / "cache/baked").iterdir()
     array, seal = folder / "ramp.npy", folder / "seal.json"
     held = array.read_bytes()
@@ -79,7 +100,7 @@ def test_damage_is_made_anew(room: Path, tmp_path: Path, damage: str) -> None:
             array.unlink()
         case "not JSON":
             seal.write_bytes(b"{")
-    assert same(baked("a", (room,), make)) and same(baked("a", (room,), make)) and make.times == 2
+    assert same(baked("a", sources_hash(room), make)) and same(baked("a", sources_hash(room), make)) and make.times == 2
 
 
 def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
@@ -88,7 +109,7 @@ def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
     """The arrays are right all the same; one line tells why the next process makes them anew."""
     (tmp_path / "cache").write_text("a file where a folder should be")
     make = Maker()
-    assert same(baked("a", (room,), make)) and same(baked("a", (room,), make)) and make.times == 2
+    assert same(baked("a", sources_hash(room), make)) and same(baked("a", sources_hash(room), make)) and make.times == 2
     told = capsys.readouterr().err
     assert told.startswith("note: ") and "not kept" in told and len(told.splitlines()) == 1
 
@@ -99,8 +120,8 @@ def test_who_makes_it_at_once_gets_the_same_and_leaves_nothing(room: Path, tmp_p
     left.mkdir(parents=True)
     (left / "ramp.npy").write_bytes(b"half")
     code = (
-        "import sys, pathlib, numpy as np\nfrom cosim.core.baked import baked\nsys.stdin.readline()\n"
-        "print(int(baked('a', (pathlib.Path(sys.argv[1]),), lambda: {'n': np.arange(200000)})['n'].sum()))"
+        "import sys, pathlib, numpy as np\nfrom cosim.core.baked import baked, sources_hash\nsys.stdin.readline()\n"
+        "print(int(baked('a', sources_hash(pathlib.Path(sys.argv[1])), lambda: {'n': np.arange(200000)})['n'].sum()))"
     )
     makers = [
         subprocess.Popen([sys.executable, "-c", code, str(room)], stdin=-1, stdout=-1, text=True) for _ in range(4)
