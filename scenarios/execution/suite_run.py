@@ -18,6 +18,7 @@ from cosim.policies.load import load_policy
 from cosim.records.record import NO_RENDERER
 from cosim.records.run_folder import RunFolder, RunSpec
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
@@ -83,11 +84,14 @@ def run(
 
 
 def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions) -> RunSpec:
-    """What a run is, for its folder. policy: its name."""
-    manifest = driver.manifest
+    """What a run is, for its folder. policy: its name. Raises UsageError when a robot has no mount for its camera."""
+    manifest, robots = driver.manifest, sorted({scenario.robot for scenario in picked})
+    if manifest.camera is not None:
+        for robot in robots:
+            manifest.camera.on(robot_called(robot))
     return RunSpec(
         suite=whole.name,
-        robot=", ".join(sorted({scenario.robot for scenario in picked})),
+        robot=", ".join(robots),
         suite_version=whole.version,
         suite_hash=whole.content_hash,
         policy=policy,

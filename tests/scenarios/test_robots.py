@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
+import re
 from pathlib import Path
 
 import msgspec
@@ -17,6 +18,7 @@ from cosim.core.errors import RunError, SpecError, UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, Signal, Street
 from cosim.episode.control import command_of
+from cosim.episode.driver import Driver
 from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
@@ -40,6 +42,7 @@ from scenarios.builders.fits import misfits
 from scenarios.catalog import load_suite, with_robot
 from scenarios.checks import small_scenario
 from scenarios.execution.places import place
+from scenarios.execution.suite_run import run, run_spec
 from tests.conftest import Cosim
 from tests.spec.test_fits import barrier, crossroads, from_west_to_east
 from tests.tiny_street import tiny_map
@@ -86,6 +89,17 @@ def barrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
     row = dataclasses.replace(BARROW, urdf=str(tmp_path / "barrow.urdf"))
     monkeypatch.setitem(table.ROBOTS, "barrow", row)  # type: ignore[arg-type]
     return row
+
+
+class Seeing:
+    """A policy whose camera sits on a mast."""
+
+    manifest = Manifest("seeing", camera=CameraSpec(mount="mast"))
+
+    def reset(self, scenario_id: str, seed: int) -> None: ...
+
+    def act(self, observation: Observation) -> Command:
+        return Command(1.0, 0.0)
 
 
 EVERY = pytest.mark.parametrize("robot", [*ROBOTS.values(), BARROW], ids=[*ROBOTS, "barrow"])
@@ -181,6 +195,19 @@ def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
     assert CameraSpec(mount=own).on(barrow) == CameraSpec(mount=own).on(SCOUT) == own
     with pytest.raises(UsageError, match="unknown camera mount of robot 'scout' 'mast'"):
         CameraSpec(mount="mast").on(SCOUT)
+
+
+def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(barrow: Robot, tmp_path: Path) -> None:
+    """No episode crashes over it, no folder is made; with the robot that has it the run may begin."""
+    policy = Seeing()
+    for name in ("courier", "scout"):
+        said = f"unknown camera mount of robot '{name}' 'mast'. Valid choices: front."
+        with pytest.raises(UsageError, match=re.escape(said)):
+            run("reactive", policy, episodes=1, out=tmp_path / "run", options=EpisodeOptions(robot=name))
+    assert not (tmp_path / "run").exists()
+    whole = with_robot(load_suite("reactive"), barrow.name)
+    spec = run_spec(whole, whole.scenarios[:1], "p", Driver.of(policy), EpisodeOptions(camera="bullet"))
+    assert spec.robot == "barrow"
 
 
 def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> None:
