@@ -32,7 +32,7 @@ class EventKind:
 
     name: in scenarios, on the command line, in tables. people: fewest and most. layout: where a reactive scenario has
     it; None straight over a crosswalk. group(half_width_m, rng) -> how many people a drawn one has; None: any number.
-    on_long_ways: long-horizon scenarios have it too.
+    on_long_ways: long-horizon scenarios have it too, on sidewalks as wide as its layout says.
 
     trigger_m: it begins when the robot is so far before its place along the route; below 0, when the robot has just
     come so far past it; None, when the robot is on the crosswalk. begin(event, number) -> person `number` before that.

@@ -7,11 +7,13 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 import msgspec
+import numpy as np
 import shapely
 
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
 from cosim.place.street_map import StreetMap
+from cosim.spec.event_kind import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 
@@ -84,3 +86,16 @@ def events_along(
         time_limit_s=time_limit_s,
         robot=robot.name,
     )
+
+
+def people_of(kind: EventKind, half_width_m: float, robot: Robot, rng: np.random.Generator) -> int:
+    """How many people a drawn event has on a sidewalk or crosswalk, so that the robot finds room beside them."""
+    if kind.group is not None:
+        return kind.group(half_width_m - 0.5 * wider_m(robot), rng)
+    fewest, most = kind.people
+    return int(rng.integers(fewest, most + 1))
+
+
+def wider_m(robot: Robot) -> float:
+    """By how much a robot is wider than the one that the layouts of events are written for."""
+    return robot.width_m - COURIER.width_m

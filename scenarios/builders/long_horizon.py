@@ -16,11 +16,12 @@ from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
-from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of
+from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of, people_of, wider_m
 from scenarios.builders.hems import hem
 from scenarios.events import EVENT_KINDS
 
@@ -63,6 +64,7 @@ class _Draft(NamedTuple):
     seed: int
     scenario_id: str
     robot: Robot
+    kinds: EventKinds
 
     @property
     def half_width_m(self) -> float:
@@ -74,7 +76,13 @@ _Fences = Callable[[_Draft, Polyline, Sequence[Port]], tuple[Barrier, ...]]
 
 
 def build_long_horizon(
-    place: Place, street_map: StreetMap, graph: WalkGraph, seed: int, scenario_id: str, robot: Robot = COURIER
+    place: Place,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    seed: int,
+    scenario_id: str,
+    robot: Robot = COURIER,
+    kinds: EventKinds = EVENT_KINDS,
 ) -> Scenario:
     """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are searched for that can be
     fenced in all along. Raises SpecError with the reason that stands in the way most often, and what would help."""
@@ -87,7 +95,7 @@ def build_long_horizon(
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
-    draft = _Draft(place, street_map, graph, seed, scenario_id, robot)
+    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds)
     drawn, searched = Refusals(), Refusals()
     draws = (lambda: _along(draft, rng, draw_way(street_map, graph, rng, candidates), _barriers) for _ in range(TRIES))
     found = first_of(draws, drawn) or first_of(_search(draft, candidates), searched)
@@ -122,7 +130,7 @@ def _along(
         time_limit_s=max(300.0, route.length_m / 0.2),
         robot=draft.robot,
     )
-    events = draw_events(street_map, route, way, rng, 2.0 * (draft.robot.width_m + BESIDE_EVENT_M))
+    events = draw_events(street_map, route, way, rng, draft.robot, draft.kinds)
     return msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
 
 
@@ -241,30 +249,40 @@ def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteC
 
 
 def draw_events(
-    street_map: StreetMap, route: Polyline, way: Sequence[Port], rng: np.random.Generator, wide_m: float
+    street_map: StreetMap,
+    route: Polyline,
+    way: Sequence[Port],
+    rng: np.random.Generator,
+    robot: Robot,
+    kinds: EventKinds,
 ) -> tuple[Event, ...]:
-    """Events about every EVENT_EVERY_M metres, on straight pieces of sidewalk at least `wide_m` wide."""
-    places = []
+    """Events about every EVENT_EVERY_M metres, on straight pieces of sidewalk wide enough for event and robot."""
+    layouts = {kind.name: kind.layout for kind in kinds.values() if kind.on_long_ways and kind.layout is not None}
+    if not layouts:
+        return ()
+    places, wide_m = [], 2.0 * (robot.width_m + BESIDE_EVENT_M)
     for s_m in np.arange(35.0, route.length_m - 25.0, 5.0):
         strip = _sidewalk_at(street_map, way, route, float(s_m))
         if strip is not None and strip.width_m >= wide_m and _is_straight(route, float(s_m)):
             places.append((float(s_m), strip.width_m / 2))
     events: list[Event] = []
     next_s_m = 0.0
-    kinds = rng.permutation([kind.name for kind in EVENT_KINDS.values() if kind.on_long_ways]).tolist()
+    names = rng.permutation([*layouts]).tolist()
     for s_m, half_width_m in places:
-        if s_m < next_s_m:
+        name = names[len(events) % len(names)]
+        if s_m < next_s_m or half_width_m < layouts[name].half_width_m + wider_m(robot):
             continue
         pose = route.at(s_m)
         events.append(
             Event(
                 id=f"e{len(events)}",
-                kind=kinds[len(events) % len(kinds)],
+                kind=name,
                 x_m=pose.x_m,
                 y_m=pose.y_m,
                 heading_rad=pose.heading_rad,
                 route_s_m=s_m,
                 half_width_m=half_width_m,
+                people=people_of(kinds[name], half_width_m, robot, rng),
                 speed_mps=float(rng.uniform(1.1, 1.65)),
                 side=1 if rng.random() < 0.5 else -1,
             )

@@ -19,7 +19,7 @@ from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
-from scenarios.builders.drawing import events_along, first_that_fits
+from scenarios.builders.drawing import events_along, first_that_fits, people_of, wider_m
 from scenarios.builders.long_horizon import route_crossings
 
 _LIMIT_S = 60.0
@@ -89,9 +89,6 @@ def build_reactive(
 
 
 def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: Robot) -> Event:
-    fewest, most = kind.people
-    half_m = at.half_width_m - 0.5 * _wider_m(robot)
-    people = int(rng.integers(fewest, most + 1)) if kind.group is None else kind.group(half_m, rng)
     return Event(
         id="e0",
         kind=kind.name,
@@ -101,7 +98,7 @@ def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: 
         route_s_m=at.route_s_m,
         half_width_m=at.half_width_m,
         half_length_m=at.half_length_m,
-        people=people,
+        people=people_of(kind, at.half_width_m, robot, rng),
         speed_mps=float(rng.uniform(*_SPEEDS_MPS)),
         side=1 if rng.random() < 0.5 else -1,
     )
@@ -109,7 +106,7 @@ def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: 
 
 def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
     half_m = strip.width_m / 2
-    if half_m < layout.half_width_m + _wider_m(robot):
+    if half_m < layout.half_width_m + wider_m(robot):
         raise SpecError("sidewalk too narrow")
     way_m, event_m = float(rng.uniform(*layout.way_m)), float(rng.uniform(*layout.event_m))
     reach_m = max(way_m, event_m)
@@ -129,11 +126,6 @@ def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generat
     return _EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
 
 
-def _wider_m(robot: Robot) -> float:
-    """By how much a robot is wider than the one that the layouts of events are written for."""
-    return robot.width_m - COURIER.width_m
-
-
 def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
     leave: Literal[0, 1] = 1 if rng.random() < 0.5 else 0
     if not 5.0 <= strip.length_m <= 12.0 or None in strip.corners:
@@ -141,7 +133,7 @@ def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator
     if strip.signalised:
         raise SpecError("crossing signalised: waiting there takes longer than the episode")
     ends = strip.line[[0, -1], :2] if leave else strip.line[[-1, 0], :2]
-    route = Polyline(np.round(_straight_over(street_map, ends, _ROOM_M + 0.5 * _wider_m(robot)), 3)).resampled(0.99)
+    route = Polyline(np.round(_straight_over(street_map, ends, _ROOM_M + 0.5 * wider_m(robot)), 3)).resampled(0.99)
     route = Polyline(np.round(route.points, 3))
     crossings = route_crossings(street_map, route, [Port(strip.id, 0 if leave else 1), Port(strip.id, leave)])
     enter_m, leave_m = crossings[0].enter_s_m, crossings[0].leave_s_m

@@ -83,7 +83,7 @@ class _Drawn(NamedTuple):
         seeds = range(self.seed, self.seed + count)
         ids = [f"{self.name}-{seed:03d}" for seed in seeds]
         drawn_on, build = (self.where, self.street_map, self.graph), long_horizon.build_long_horizon
-        return [build(*drawn_on, seed, name, self.robot) for seed, name in zip(seeds, ids, strict=True)], []
+        return [build(*drawn_on, seed, name, self.robot, self.kinds) for seed, name in zip(seeds, ids, strict=True)], []
 
     def reactive(self, count: int | None, asked: Sequence[str]) -> tuple[list[Scenario], list[str]]:
         """So many reactive scenarios, their events in turn, and a sentence for each event there is no room for."""

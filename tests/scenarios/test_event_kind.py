@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import math
 from pathlib import Path
 
@@ -15,14 +16,19 @@ from cosim.core.state import Age, Command, PersonKind
 from cosim.episode.ports import Manifest
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
+from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKind, EventKinds, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
-from cosim.spec.scenario import City, CrowdSpec, read_suite, write_suite
+from cosim.spec.robot import COURIER, ROBOTS, Robot
+from cosim.spec.scenario import City, CrowdSpec, event_faults, read_suite, write_suite
+from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.builders.sample import suite_on_map
+from scenarios.checks import small_scenario
 from scenarios.events import EVENT_KINDS
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, spot, walked_to, walker_at
 from scenarios.execution.episode import Episode
+from scenarios.execution.places import place
 from scenarios.viewing.eventsheet import COLUMNS, rows_of, summary
 from sumo_nets.city.store import write_city
 from tests.conftest import ROOT
@@ -58,6 +64,7 @@ SWAPPING = EventKind(
     age=Age.CHILD,
     passed_round=True,
 )
+NEEDS_ROOM = SidewalkLayout((16.0, 18.0), (9.0, 10.0), half_width_m=1.9)
 KINDS: EventKinds = EVENT_KINDS | {SWAPPING.name: SWAPPING}  # type: ignore[operator]
 
 
@@ -83,6 +90,20 @@ def test_a_kind_is_named_in_its_own_file_alone() -> None:
         if isinstance(node, ast.Constant) and node.value in EVENT_KINDS and path.parent.name != "events"
     ]
     assert not named
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=ROBOTS)
+def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
+    """One of several people, where its layout and the robot find room, as many as its row says; none of no kind."""
+    where = small_scenario().place
+    _, street_map = place(where)
+    loitering = dataclasses.replace(SWAPPING, people=(2, 4), layout=NEEDS_ROOM, on_long_ways=True)
+    for kinds, count in (({loitering.name: loitering}, 1), ({SWAPPING.name: SWAPPING}, 0), (EVENT_KINDS, 2)):
+        drawn = build_long_horizon(where, street_map, WalkGraph(street_map), 2, "long", robot, kinds)
+        assert len(drawn.events) == count and list(event_faults(drawn, kinds)) == []
+        for event in drawn.events:
+            layout = kinds[event.kind].layout
+            assert layout is not None and event.half_width_m >= layout.half_width_m + robot.width_m - COURIER.width_m
 
 
 @pytest.mark.engine
