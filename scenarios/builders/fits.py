@@ -13,10 +13,11 @@ from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.telling import Tell, untold
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.robot import ROBOTS, robot_called
-from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite
+from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.hdri import read_hdri
 from scenarios.builders.barriers import outline
+from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.crowd.room import Room
 
@@ -38,7 +39,7 @@ def check_places(whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untol
     there: dict[Place, list[Scenario]] = {}
     for scenario in scenarios:
         there.setdefault(scenario.place, []).append(scenario)
-    faults = list(_not_here(scenarios))
+    faults = [*_not_here(scenarios), *_odd_events(scenarios)]
     for number, (where, those) in enumerate(there.items()):
         tell(LOOKING, number / len(there))
         try:
@@ -116,6 +117,12 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
             yield f"barriers[{number}] stands {far_m:.0f} m from strip '{barrier.strip}', which it should close"
         elif fence.distance(route) < half_width_m:
             yield f"barriers[{number}] on strip '{barrier.strip}' stands across the route"
+
+
+def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:
+    """Events of no kind that there is, or not as the row of their kind says."""
+    for scenario in scenarios:
+        yield from (f"scenario '{scenario.id}': {fault}" for fault in event_faults(scenario, EVENT_KINDS))
 
 
 def _crowded(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:

@@ -20,9 +20,11 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKind, EventKinds, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from cosim.spec.robot import COURIER, ROBOTS, Robot
-from cosim.spec.scenario import City, CrowdSpec, event_faults, read_suite, write_suite
+from cosim.spec.scenario import City, CrowdSpec, Scenario, event_faults, read_suite, write_suite
+from scenarios.builders.fits import check_places
 from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.builders.sample import suite_on_map
+from scenarios.catalog import load_suite
 from scenarios.checks import small_scenario
 from scenarios.events import EVENT_KINDS
 from scenarios.events.sight import sight_of
@@ -104,6 +106,25 @@ def test_long_ways_have_the_kinds_of_the_table_handed_in(robot: Robot) -> None:
         for event in drawn.events:
             layout = kinds[event.kind].layout
             assert layout is not None and event.half_width_m >= layout.half_width_m + robot.width_m - COURIER.width_m
+
+
+def test_a_suite_made_in_python_is_refused_as_one_from_a_file() -> None:
+    """Events that are not as the table says are told before anything runs, not one crashed episode each."""
+    whole = load_suite("reactive")
+    first, second = whole.scenarios[:2]
+    odd = [with_event(first, people=3), with_event(second, kind="swapping")]
+    with pytest.raises(SpecError) as refusal:
+        check_places(whole, odd)
+    told = str(refusal.value)
+    assert f"scenario '{first.id}': event 'e0': people of '{first.events[0].kind}' must be 1, not 3" in told
+    assert (
+        f"scenario '{second.id}': Invalid enum value 'swapping' - at `$.events[0].kind`. Valid choices: obstr" in told
+    )
+
+
+def with_event(scenario: Scenario, **changed: object) -> Scenario:
+    """The scenario, its event changed."""
+    return msgspec.structs.replace(scenario, events=(msgspec.structs.replace(scenario.events[0], **changed),))
 
 
 @pytest.mark.engine
