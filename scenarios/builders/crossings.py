@@ -12,7 +12,7 @@ from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import Place, Scenario
-from scenarios.builders.drawing import Refusals, events_along
+from scenarios.builders.drawing import Refusals, bare_scenario
 from scenarios.builders.long_horizon import on_road_m, route_crossings
 
 START_BEFORE_CROSSING_M: Final = 10.0
@@ -61,7 +61,7 @@ def _over(place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, se
     crossings = route_crossings(street_map, route, way[1:])
     if on_road_m(street_map, route, crossings) > OFF_ROAD_M:
         raise MapError("the way lies on a road")
-    return events_along(
+    return bare_scenario(
         route,
         crossings,
         place,

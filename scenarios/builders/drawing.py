@@ -60,7 +60,7 @@ def first_of(draws: Iterable[Callable[[], Scenario]], refusals: Refusals) -> Sce
     return None
 
 
-def events_along(
+def bare_scenario(
     route: Polyline,
     crossings: tuple[RouteCrossing, ...],
     place: Place,

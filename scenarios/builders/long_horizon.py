@@ -21,7 +21,7 @@ from cosim.spec.events import Event
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
-from scenarios.builders.drawing import TRIES, Refusals, events_along, first_of, people_of, wider_m
+from scenarios.builders.drawing import TRIES, Refusals, bare_scenario, first_of, people_of, wider_m
 from scenarios.builders.hems import hem
 from scenarios.events import EVENT_KINDS
 
@@ -119,7 +119,7 @@ def _along(
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
     barriers = fences(draft, route, way)
-    bare = events_along(
+    bare = bare_scenario(
         route,
         crossings,
         draft.place,

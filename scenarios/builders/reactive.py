@@ -19,7 +19,7 @@ from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
-from scenarios.builders.drawing import events_along, first_that_fits, people_of, wider_m
+from scenarios.builders.drawing import bare_scenario, first_that_fits, people_of, wider_m
 from scenarios.builders.long_horizon import route_crossings
 
 _LIMIT_S = 60.0
@@ -71,7 +71,7 @@ def build_reactive(
             if layout is None
             else _along_sidewalk(layout, strip, rng, robot)
         )
-        bare = events_along(
+        bare = bare_scenario(
             Polyline(at.route),
             at.crossings,
             place,

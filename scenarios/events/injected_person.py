@@ -1,4 +1,4 @@
-"""A person: an injected pedestrian that walks its path, stays at the end for its time, and is gone.
+"""An injected pedestrian: walks its path, stays at the end for its time, and is gone.
 
 It goes round people and the robot; a point of its path at which somebody or the robot stands counts as reached beside
 it.
@@ -31,7 +31,7 @@ class InjectedPerson(NamedTuple):
 
 
 def arriving(injected: Injected) -> InjectedPerson:
-    """The person as it appears: at the first point, facing the second."""
+    """An injected person as it appears: at the first point, facing the second."""
     injection = injected.injection
     (x, y), *others = injection.path
     facing = injection.heading_rad or 0.0
@@ -71,12 +71,12 @@ def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuer
 
 
 def shown_id(injection: Injection) -> str:
-    """The id under which the world shows a person."""
+    """The id under which the world shows an injected person."""
     return f"{GUEST}{injection.id}"
 
 
 def injected_actor(person: InjectedPerson, tick_ms: int) -> Actor:
-    """The person as the world shows it; who is held up on the way stands."""
+    """An injected person as the world shows it; who is held up on the way stands."""
     walker = person.walker
     still = "stand" if person.arrived_tick is None else person.injection.doing
     return Actor(

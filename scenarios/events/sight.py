@@ -47,7 +47,7 @@ class Sight(NamedTuple):
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
-    """The sight of person `number` of an event: it sees its fellows, people of other events, and nearby.
+    """The sight of person `number` of an event: it sees its fellows, people of other events, and who is near.
 
     waited_s: how long it has been on its way to a place on which it insists.
     """
@@ -64,7 +64,7 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
 
 
 def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:
-    """The sight of the person that is shown under this id."""
+    """The sight of the injected person that is shown under this id."""
     walkers = [walker for state in query.states if state.phase != "gone" for walker in state.walkers]
     others = (_told_apart(name, person, one) for one in query.nearby if one.id != name)
     return Sight(query, [*map(fellow, walkers), *met(others)])

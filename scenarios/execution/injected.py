@@ -1,4 +1,4 @@
-"""Injected people: injected pedestrians beside those of the events. A director around a director.
+"""Injected people, beside those of the events. A director around a director.
 
 Injections come from any thread, or from a record that is replayed; they take effect at the boundary of a step, in the
 order in which they came.
@@ -24,7 +24,7 @@ MOST_EVER: Final = 5000
 
 
 class InjectedPeople:
-    """Joins another director's replies. on_map(x_m, y_m): whether a point belongs to the place at all."""
+    """Adds injected people to a director's replies. on_map(x_m, y_m): whether a point belongs to the place at all."""
 
     def __init__(
         self, director: Director, tick_ms: int, on_map: Callable[[float, float], bool], script: Sequence[Injected] = ()

@@ -48,8 +48,8 @@ class PedestriansAgain(Pedestrians):
                 came.append(one)
             elif one in here:
                 self._engine.person.remove(one)
-        for (walk, mps), company in groupby(came, key=lambda one: (one.walk, one.mps)):
-            self._together.join([one.name for one in company], mps, walk)
+        for (walk, mps), group in groupby(came, key=lambda one: (one.walk, one.mps)):
+            self._together.join([one.name for one in group], mps, walk)
 
 
 class DriversAgain(Drivers):
