@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
-from cosim.core.whole_file import write_whole
 
 
 @dataclass(frozen=True)
@@ -59,10 +58,6 @@ class Log:
         columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
         more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
         return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)
-
-    def save(self, path: Path) -> None:
-        """Write as .npz, whole or not at all."""
-        write_whole(path, self.encoded())
 
     def encoded(self) -> bytes:
         """The compressed .npz that is the file."""
