@@ -64,11 +64,12 @@ def run_all(
 
 
 class _Slot:
-    """A worker, and what it is busy with."""
+    """A worker, and what it is busy with. ran: it has run an episode before; silent: it has said nothing since it was
+    given the next."""
 
     def __init__(self, worker: Worker) -> None:
         self.worker = worker
-        self.ready = False
+        self.ready = self.ran = self.silent = False
         self.job: Scenario | None = None
         self.heard_at = time.monotonic()
 
@@ -97,7 +98,7 @@ class _Pool:
     def give(self, scenario: Scenario) -> None:
         """Hand a scenario to an idle worker, or to a new one."""
         idle = next((w for w in self._workers if w.job is None), None) or self._start()
-        idle.job, idle.heard_at = scenario, time.monotonic()
+        idle.job, idle.heard_at, idle.silent = scenario, time.monotonic(), True
         self._folder.forget(scenario.id)
         idle.worker.give(Job(scenario, self._options))
 
@@ -107,7 +108,8 @@ class _Pool:
         self._transport.wait(POLL_S)
         for one in list(self._workers):
             if not one.worker.listen(partial(self._take, one)):
-                lost += self._lost(one, one.worker.end())
+                why = one.worker.end()
+                lost += self._lost(one, why, began=not (one.ran and one.silent) or one.worker.question is not None)
             elif one.job is None:
                 continue
             elif (question := one.worker.question) is not None:
@@ -121,7 +123,7 @@ class _Pool:
 
     def _take(self, one: _Slot, message: Message) -> None:
         """Something that a worker has said."""
-        one.heard_at = time.monotonic()
+        one.heard_at, one.silent = time.monotonic(), False
         if isinstance(message, Unable):
             raise UsageError(message.reason) if message.blames_policy else MachineError(message.reason)
         if isinstance(message, Ready):
@@ -131,7 +133,7 @@ class _Pool:
         elif not isinstance(message, Done):
             self._tell(message)
         elif one.job is not None:
-            scenario, one.job = one.job, None
+            scenario, one.job, one.ran = one.job, None, True
             self._keep(scenario, message)
 
     def _keep(self, scenario: Scenario, done: Done) -> None:
@@ -146,13 +148,13 @@ class _Pool:
             self._folder.keep(record, done.log)
             self._tell(Done(scenario.id, record.status))
 
-    def _lost(self, one: _Slot, why: str) -> list[tuple[Scenario, str]]:
-        """A worker has ended. Returns its scenario if that is not done, and why."""
+    def _lost(self, one: _Slot, why: str, *, began: bool = True) -> list[tuple[Scenario, str]]:
+        """A worker has ended. Returns its scenario if that is not done, and why, if it was begun."""
         self._workers.remove(one)
         if one.job is None:
             return []
         if one.ready:
-            return [(one.job, why)]
+            return [(one.job, why if began else "")]
         self._not_started(one, why)
         return [(one.job, "")]
 

@@ -193,23 +193,28 @@ SCENARIO = Scenario(
 
 def pooled(folder: Path, *fakes: Fake, **named: float) -> Record:
     """The record of one scenario, run by these workers, one after the other."""
+    (record,) = all_pooled(folder, (SCENARIO,), *fakes, **named)
+    return record
+
+
+def all_pooled(folder: Path, scenarios: tuple[Scenario, ...], *fakes: Fake, **named: float) -> list[Record]:
+    """The same of several scenarios."""
     transport, suite, driver = (
         Prepared(*fakes),
-        Suite(name="s", version="1", scenarios=(SCENARIO,)),
+        Suite(name="s", version="1", scenarios=scenarios),
         load_policy("stop"),
     )
     spec = RunSpec(
         suite="s", robot="courier",
         suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
-        scenarios=("s-0",), versions={},
+        scenarios=tuple(one.id for one in scenarios), versions={},
     )  # fmt: skip
     hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
         patience = Patience(**named)
         pool.run_all(held, suite.scenarios, hello, transport, jobs=1, tell=lambda _: None, patience=patience)
-        assert next(transport.waiting, None) is None and held.finished() == {"s-0"}
-    (record,) = read_records(folder / "run")
-    return record
+        assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
+    return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
 
 
 def test_an_engine_that_hangs_is_tried_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -255,6 +260,26 @@ def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     assert (folder / "trajectory.npz").read_bytes() == log and (folder / "record.json").read_bytes() == data
     assert (folder / "frames" / "000005.png").read_bytes() == b"png" and record.encoded() == data
     assert not list((tmp_path / "run").rglob("*.part"))
+
+
+class DiesIdle(Fake):
+    """It ends once it has said everything."""
+
+    def listen(self, hear: Hear) -> bool:
+        left = bool(self._messages)
+        super().listen(hear)
+        return left
+
+
+def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_path: Path) -> None:
+    """It was handed one before its end was known, and began nothing: the episode has both of its attempts left."""
+    manifest, second = load_policy("stop").manifest, msgspec.structs.replace(SCENARIO, id="s-1")
+    done, again = (
+        Done(one.id, "done", msgspec.structs.replace(begun(one, manifest, "h"), status="invalid").encoded())
+        for one in (SCENARIO, second)
+    )
+    fakes = (DiesIdle(Ready(), done), Fake(Ready(), ends=True), Fake(Ready(), again))
+    assert [one.status for one in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == ["invalid", "invalid"]
 
 
 def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:
