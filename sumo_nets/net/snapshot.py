@@ -138,18 +138,22 @@ _FIELDS: Final = tuple(name for name in StreetMap.__dataclass_fields__ if not na
 
 
 def _key(name: str, net: bytes) -> str:
-    return hashlib.sha256(_reader() + name.encode() + b"\0" + hashlib.sha256(net).digest()).hexdigest()[:32]
+    return hashlib.sha256(_READER + name.encode() + b"\0" + hashlib.sha256(net).digest()).hexdigest()[:32]
 
 
-@cache
 def _reader() -> bytes:
     """What makes a StreetMap of a net: the source of this package and of the words it uses, and the libraries."""
     rooms = [Path(sumo_nets.__file__).parent, *(Path(cosim.__file__).parent / room for room in ("core", "place"))]
     sources = [source for room in rooms for source in sorted(room.rglob("*.py"))]
-    seen = hashlib.sha256(f"{version('numpy')} {version('shapely')} {shapely.geos_version_string}".encode())
+    libraries = [*(version(name) for name in ("numpy", "scipy", "shapely")), shapely.geos_version_string]
+    seen = hashlib.sha256(" ".join(libraries).encode())
     for source in sources:
         seen.update(source.read_bytes())
     return seen.digest()
+
+
+_READER: Final = _reader()
+"""As it was imported: who edits it later does not change what this process reads."""
 
 
 def _write(path: Path, data: bytes) -> None:
