@@ -99,14 +99,14 @@ def reactive_candidates(city: City, number: int) -> Iterator[Candidates]:
 RECIPES: Mapping[SuiteName, _Recipe] = MappingProxyType(
     {
         "long-horizon": _Recipe(
-            version="0.2",
+            version="0.3",
             description="Start and goal more than 100 m apart in generated cities; one walkable path; street life.",
             expert="route",
             cities=_CITIES,
             candidates=long_horizon_candidates,
         ),
         "reactive": _Recipe(
-            version="0.1",
+            version="0.2",
             description="10 to 20 m of way with one event of pedestrians on it, each event in the same cities.",
             expert="orca",
             cities=shipped_cities(_REACTIVE_CITIES),

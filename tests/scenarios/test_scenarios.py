@@ -73,7 +73,6 @@ def first_query(scenario: Scenario) -> EventQuery:
     return query(scenario, Clock(), Moment(0, RobotState(scenario.start_pose), Street(0), 0.0), (0.7, 0.55))
 
 
-@pytest.mark.xfail(strict=True, reason="the suites were proven under hashes that left defaults out: build them anew")
 @pytest.mark.parametrize("name", SUITES)
 def test_every_scenario_comes_with_its_proof(name: str) -> None:
     """The proofs beside a suite are of these very scenarios."""
