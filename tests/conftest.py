@@ -33,7 +33,9 @@ settings.load_profile("tests")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--whole", action="store_true", help="all damaged files, where a sample is tested by default")
+    parser.addoption(
+        "--whole", action="store_true", help="all damaged files and shipped routes, where a sample is tested by default"
+    )
 
 
 def pytest_configure(config: pytest.Config) -> None:

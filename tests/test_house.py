@@ -143,7 +143,7 @@ def _public_names(module: ast.Module) -> set[str]:
 
 
 _LOOKS_INTO_AN_ID = re.compile(
-    r"""startswith\((?:GUEST|"(?:[cenv]|ei-)"\))|\bids\[\w+\]\["""
+    r"""startswith\((?:INJECTED_ID|"(?:[cenv]|ei-)"\))|\bids\[\w+\]\["""
     r"""|(?:\.id|\b(?<!\.)name)\[0\] (?:in|==|!=)|bisect_\w+\([\w.]*ids"""
 )
 

@@ -15,7 +15,7 @@ import msgspec
 from cosim.core.state import PERSON_RADIUS_M, Age, Doing, PersonKind
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, WHERE_M, Ranged, Within, shown
 
-GUEST: Final = "ei-"
+INJECTED_ID: Final = "ei-"
 """What the ids of injected pedestrians begin with."""
 
 
@@ -51,8 +51,8 @@ class Event(Ranged, frozen=True, kw_only=True):
                 f"event id {shown(self.id)}: ids of event pedestrians start with 'e', "
                 "and at most 31 of A-Z a-z 0-9 _ - follow"
             )
-        if re.match(GUEST, self.id):
-            yield f"event id '{self.id}': '{GUEST}' begins the ids of injected pedestrians"
+        if re.match(INJECTED_ID, self.id):
+            yield f"event id '{self.id}': '{INJECTED_ID}' begins the ids of injected pedestrians"
 
     @property
     def names(self) -> tuple[str, ...]:

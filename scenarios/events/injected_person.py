@@ -14,7 +14,7 @@ import numpy as np
 
 from cosim.core.state import Age, PersonKind
 from cosim.people.yielding import STEP_ROUND_GAP_M, touches
-from cosim.spec.events import GUEST, Actor, EventQuery, Walker
+from cosim.spec.events import INJECTED_ID, Actor, EventQuery, Walker
 from cosim.spec.injection import Injected, Injection
 from scenarios.events.sight import BESIDE_M, STILL_MPS, place_taken, sight_of_injected
 from scenarios.events.walking import robot_of, turned, walked_to
@@ -72,7 +72,7 @@ def _robot_stands_at(goal: tuple[float, float], walker: Walker, query: EventQuer
 
 def shown_id(injection: Injection) -> str:
     """The id under which the world shows an injected person."""
-    return f"{GUEST}{injection.id}"
+    return f"{INJECTED_ID}{injection.id}"
 
 
 def injected_actor(person: InjectedPerson, tick_ms: int) -> Actor:

@@ -85,9 +85,11 @@ class _Process:
     def send(self, message: Hello | Job) -> None:
         """Say something. A process that died or was stopped while it was idle does not hear it."""
         with suppress(OSError):
-            self.wire.send(encode_message(message), within_s=ENDING_S)
+            self.wire.post(encode_message(message))
 
     def listen(self, hear: Hear) -> bool:
+        with suppress(OSError):
+            self.wire.flush()
         try:
             for message in self.wire.received():
                 hear(decode_message(message))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import struct
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Final
 
 _LENGTH: Final = struct.Struct("!I")
@@ -20,15 +21,27 @@ class Wire:
     """
 
     def __init__(self, end: socket.socket) -> None:
-        self._end, self._held = end, bytearray()
+        self._end, self._held, self._unsent = end, bytearray(), bytearray()
 
     def fileno(self) -> int:
         return self._end.fileno()
 
-    def send(self, message: bytes, within_s: float | None = None) -> None:
-        """Send a message; waits for room, up to within_s seconds. Raises OSError when the other end is gone."""
-        self._end.settimeout(within_s)
+    def send(self, message: bytes) -> None:
+        """Send a message; waits for room. Raises OSError when the other end is gone."""
+        self._end.settimeout(None)
         self._end.sendall(_LENGTH.pack(len(message)) + message)
+
+    def post(self, message: bytes) -> None:
+        """Send a message without waiting: what there is no room for goes with `flush`. Raises OSError likewise."""
+        self._unsent += _LENGTH.pack(len(message)) + message
+        self.flush()
+
+    def flush(self) -> None:
+        """Send of what was posted as much as there is room for."""
+        self._end.setblocking(False)
+        with suppress(BlockingIOError):
+            while self._unsent:
+                del self._unsent[: self._end.send(self._unsent)]
 
     def receive(self) -> bytes:
         """The next message, waited for. Raises EOFError when none will come."""

@@ -46,11 +46,11 @@ def board_of(scenarios: tuple, done: tuple[str, ...] = (), **options: object) ->
 def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
     """A line for each episode that ends: its status, how many of how many, about how long it still takes."""
     board, clock, said = board_of(LONG[:3], done=(LONG[0].id,))
-    clock.now_s = 60.0
+    clock.now_s = 40.0
     board.tell(Done(LONG[1].id, "done"))
     (line,) = said.getvalue().splitlines()
     rest_m, gone_m = LONG[2].route_line.length_m + SETUP_M, LONG[1].route_line.length_m + SETUP_M
-    assert line == f"{LONG[1].id}: done, 2 of 3; about {round(60.0 * rest_m / gone_m, -1):.0f} s left"
+    assert line == f"{LONG[1].id}: done, 2 of 3; about {round(40.0 * rest_m / gone_m, -1):.0f} s left"
     clock.now_s = 160.0
     board.tell(Done(LONG[2].id, "crashed"))
     assert said.getvalue().splitlines()[1] == f"{LONG[2].id}: crashed, 3 of 3"

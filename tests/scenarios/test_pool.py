@@ -288,6 +288,23 @@ def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:
         pooled(tmp_path, Fake(ends=True), Fake(ends=True))
 
 
+def test_a_job_of_any_length_reaches_a_worker_that_listens_late() -> None:
+    """More than a socket holds is posted without waiting, and arrives whole, in order, as it is taken."""
+    ours, theirs = socket.socketpair()
+    run, worker, jobs = Wire(ours), Wire(theirs), [os.urandom(3_000_000), b"the next"]
+    for job in jobs:
+        run.post(job)
+    heard: list[bytes] = []
+    while len(heard) < len(jobs):
+        heard += worker.received()
+        run.flush()
+    assert heard == jobs
+    worker.close()
+    with pytest.raises(OSError):
+        run.post(jobs[0])
+    run.close()
+
+
 def test_half_a_message_keeps_nobody_waiting() -> None:
     """Who is stopped in the middle of a message of megabytes is not waited for: what came whole is told, the rest when
     it comes, and the end after all of it."""

@@ -149,12 +149,20 @@ def test_free_space_ends_at_furniture() -> None:
     assert not free.intersects(Point(20.0, 1.2))
 
 
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """The shipped routes: of the first city by default, all with --whole."""
+    if "shipped" in metafunc.fixturenames:
+        whole = metafunc.config.getoption("--whole")
+        sample = [scenario for scenario in LONG if whole or scenario.place == LONG[0].place]
+        metafunc.parametrize("shipped", sample, ids=lambda s: s.id)
+
+
 @pytest.mark.engine
-@pytest.mark.parametrize("scenario", LONG, ids=lambda s: s.id)
-def test_a_scenario_has_exactly_one_walkable_path(scenario: Scenario) -> None:
+def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
     """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
     from scenarios.execution.places import place
 
+    scenario = shipped
     _, street_map = place(scenario.place)
     route = scenario.route_line
     near = shapely.buffer(LineString(scenario.route), 200.0)
