@@ -53,13 +53,13 @@ class DiesLate(Base):
     def act(self, observation):
         from scenarios.execution.wire import Wire
         send = Wire.send
-        def dying(wire, message, within_s=None):
+        def dying(wire, message):
             done = b"Done" in message[:20] and len(message) > 2000
             if done and b"t-2" in message[:50] and not Path("half").exists():
                 Path("half").touch()
                 wire._end.sendall(len(message).to_bytes(4, "big") + message[: len(message) // 2])
                 os.kill(os.getpid(), signal.SIGKILL)
-            send(wire, message, within_s)
+            send(wire, message)
             if done and b"t-1" in message[:50]: os.kill(os.getpid(), signal.SIGKILL)
         if send.__name__ == "send": Wire.send = dying
         self.count += 1
