@@ -162,7 +162,7 @@ def _quaternions(turns: Floats) -> Floats:
     z = np.cross(x, turns[..., 1])
     z /= np.linalg.norm(z, axis=-1, keepdims=True)
     y = np.cross(z, x)
-    turned = Rotation.from_matrix(np.stack([x, y, z], axis=-1).reshape(-1, 3, 3))
+    turned = Rotation.from_matrix(np.stack([x, y, z], axis=-1).reshape(-1, 3, 3), assume_valid=True)
     return np.asarray(turned.as_quat().reshape(*turns.shape[:-2], 4))
 
 

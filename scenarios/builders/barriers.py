@@ -74,8 +74,12 @@ def _slanting_barrier(street_map: StreetMap, port: Port) -> Barrier:
     if corner is not None:
         reach_m = min(MOUTH_M, line.length_m / 2)
         left, right = (mouth(edge, along, reach_m, corner.polygon) for edge in (left, right))
-    across = left - right
-    x_m, y_m = ((left + right) / 2 + into_m * along).tolist()
+    return barrier_along(left - right, (left + right) / 2 + into_m * along, port)
+
+
+def barrier_along(across: Floats, middle: Floats, port: Port) -> Barrier:
+    """The barrier that closes a port along the vector (2,) `across`, about (2,) `middle`, metres."""
+    x_m, y_m = middle.tolist()
     return Barrier(
         x_m=round(x_m, 3),
         y_m=round(y_m, 3),

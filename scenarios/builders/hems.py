@@ -6,7 +6,6 @@ is; fences at the ports leave it open. A hem closes the way's own ground whereve
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -17,7 +16,7 @@ from cosim.core.geometry import Floats
 from cosim.place import overlay
 from cosim.place.street_map import SEAM_M, Port, StreetMap, Strip, union_closed
 from cosim.spec.scenario import Barrier
-from scenarios.builders.barriers import OVERHANG_M, THICKNESS_M, branches, corner_of
+from scenarios.builders.barriers import barrier_along, branches, corner_of
 
 _NEAR_M = 3.0
 """Ground farther from the way does not border on it."""
@@ -51,7 +50,8 @@ def hem(street_map: StreetMap, way: Sequence[Port]) -> tuple[Barrier, ...]:
     ports = list(dict.fromkeys([*branches(street_map, way), *ends]))
     if not len(sides) or not ports:
         return ()
-    return tuple(_fence(sides[i], ports[k]) for i, k in _named(street_map, sides, ports))
+    middles, across = sides.mean(axis=1), sides[:, 1] - sides[:, 0]
+    return tuple(barrier_along(across[i], middles[i], ports[k]) for i, k in _named(street_map, sides, ports))
 
 
 def _named(street_map: StreetMap, sides: Floats, ports: Sequence[Port]) -> list[tuple[int, int]]:
@@ -83,18 +83,3 @@ def _sides(line: shapely.Geometry) -> Floats:
     pairs = np.stack([points[:-1], points[1:]], axis=1)
     straight: Floats = pairs[np.hypot(*(pairs[:, 1] - pairs[:, 0]).T) >= _SHORTEST_M]
     return straight
-
-
-def _fence(side: Floats, port: Port) -> Barrier:
-    """The fence along a straight piece of the border."""
-    across = side[1] - side[0]
-    x_m, y_m = side.mean(axis=0).tolist()
-    return Barrier(
-        x_m=round(x_m, 3),
-        y_m=round(y_m, 3),
-        heading_rad=round(math.atan2(-across[0], across[1]), 5),
-        length_m=round(float(np.hypot(*across)) + 2 * OVERHANG_M, 3),
-        strip=port.strip,
-        end=port.end,
-        thickness_m=THICKNESS_M,
-    )

@@ -7,7 +7,7 @@ import gzip
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
@@ -16,10 +16,13 @@ import pytest
 from cosim.core.errors import WRONG_USE, MapError
 from sumo_nets.maps import rawfile
 from sumo_nets.maps.importer import Options
-from sumo_nets.maps.mapstore import checked_map, import_map, map_net, maps_folder
+from sumo_nets.maps.mapstore import checked_map, import_map, map_net
 from sumo_nets.net.netfacts import read_facts
 from sumo_nets.net.netfile import read_net
 from tests.mutate_maps import DAMAGES, damaged
+from tests.sumo_nets.conftest import kept
+
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 SAMPLE, WHOLE = 19, 300
 """So many damaged maps are imported: one of each kind by default, all of them with --whole."""
@@ -37,19 +40,6 @@ TOWN = """<?xml version="1.0" encoding="UTF-8"?>
 <way id="300"><nd ref="1"/><nd ref="4"/><tag k="highway" v="footway"/></way>
 </osm>
 """
-
-
-@pytest.fixture(autouse=True, scope="module")
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Maps are kept in a folder of this module's own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
-def kept() -> list[str]:
-    """Everything in the folder of maps, scratch folders included."""
-    return sorted(p.name for p in maps_folder().iterdir()) if maps_folder().is_dir() else []
 
 
 def nested(depth: int) -> bytes:

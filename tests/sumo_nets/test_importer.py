@@ -7,7 +7,6 @@ import gzip
 import json
 import re
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -32,7 +31,6 @@ from sumo_nets.maps.mapstore import (
     known_maps,
     map_name,
     map_net,
-    maps_folder,
     read_map,
 )
 from sumo_nets.maps.signalcheck import mend_signals
@@ -40,6 +38,9 @@ from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.netfacts import read_facts, walks_of
 from sumo_nets.net.netfile import read_net
 from tests.conftest import Cosim
+from tests.sumo_nets.conftest import kept
+
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 MAPS = Path(__file__).parents[3] / "shared" / "maps"
 NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
@@ -79,19 +80,6 @@ def small_city() -> bytes:
     path = cache_folder() / "small.net.xml"
     build_city(City(seed=3, size_m=300.0), path)
     return path.read_bytes()
-
-
-@pytest.fixture(autouse=True, scope="module")
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Maps are kept in a folder of this run's own."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COSIM_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
-def kept() -> list[str]:
-    """Everything in the folder of maps, scratch folders included."""
-    return sorted(p.name for p in maps_folder().iterdir()) if maps_folder().is_dir() else []
 
 
 @pytest.mark.engine
