@@ -333,7 +333,8 @@ app.command(
 )(direct)
 app.command(
     rich_help_panel=MEASURE,
-    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
+    epilog="Examples:  \n`cosim bench --rounds 5`  \n`cosim bench --only driving --compare ../cosim-before`  \n"
+    "`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
     "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
 )(bench)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)

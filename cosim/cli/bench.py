@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
+from rich import box
+from rich.markup import escape
+from rich.table import Column, Table
 
 from cosim.cli.consoles import out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
 from cosim.cli.progress import doing
-from cosim.core.errors import unknown
+from cosim.core.errors import UsageError, unknown
+
+if TYPE_CHECKING:
+    from scenarios.bench.figures import Figure
 
 NONE = ("none: see below", "")
 
@@ -24,6 +31,17 @@ def bench(
             "vehicles behave) or crossings (how a policy, they and the lights get on).",
         ),
     ] = "environment",
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="For `environment` and `camera`: this measurement alone; repeatable."),
+    ] = None,
+    compare: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="CHECKOUT",
+            help="For `environment` and `camera`: take each figure there too, in turns, and show the ratios.",
+        ),
+    ] = None,
     rounds: Annotated[int, typer.Option(min=1, help="How often each figure is taken; medians are shown.")] = 3,
     cities: Annotated[
         int | None, typer.Option(min=1, help="How many cities: 3 for `crowd`, 20 for `crossings` unless you say.")
@@ -47,53 +65,73 @@ def bench(
     if what == "crossings":
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)
         return
-    if what == "camera":
+    only = only or []
+    if compare is not None:
+        _compare(compare, what, only, rounds)
+    elif what == "camera" and not only:
         bench_cameras(rounds)
-        return
-    from scenarios.bench import street as bench_street
-    from scenarios.bench.speed import TIMED_PARTS, spread, time_episodes
+    else:
+        print_figures(_taken(what, only, [None], rounds)[0])
 
+
+def _taken(
+    what: str, only: Sequence[str], checkouts: Sequence[Path | None], rounds: int
+) -> list[dict[str, list[Figure]]]:
+    """The figures of checkouts, None for this one, each value of each round."""
+    from scenarios.bench.measurements import CAMERA, ENVIRONMENT, ROOT, chosen, take_rounds
+
+    names = chosen(only, tuple(CAMERA) if what == "camera" else ENVIRONMENT)
     with doing("measuring") as tell:
-        report = time_episodes(rounds, lambda words: tell(f"measuring: {words}"))
-        streets = bench_street.time_street(rounds, lambda words: tell(f"measuring: {words}"))
-    table = Table("2 km city, 50 persons, 20 vehicles, 96x96 camera at 4 Hz", "median", "spread", "target")
-    rows: list[tuple[str, list[float], str]] = [
-        ("simulated seconds per second", [d.factor for d in report.big], ">= 8"),
-        ("first frame of the cached city, s", report.first_frame_s, "<= 5"),
-        ("resident memory, MiB", [d.memory_mib for d in report.big], "<= 1024"),
-        ("cost of a step: 2 km / 0.5 km", report.growth(), "about 1"),
-        ("director's round trip, ms", [d.round_trip_ms for d in report.big], "<= 0.4"),
-        ("persons shown", [float(d.people) for d in report.big], ""),
-    ]
-    for name, values, target in rows:
-        table.add_row(name, *spread(values), target)
+        return take_rounds(names, [one or ROOT for one in checkouts], rounds, lambda words: tell(f"measuring: {words}"))
+
+
+def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
+    """A row per figure that both checkouts take: medians here and there, and the ratio round by round."""
+    from scenarios.bench.figures import spread
+
+    if not (other / "scenarios" / "bench" / "take.py").is_file():
+        raise UsageError(f"--compare {other}: no checkout of cosim that can be measured (scenarios/bench/take.py)")
+    here, there = _taken(what, only, [None, other.resolve()], rounds)
+    table = Table(*_columns("figure", "here", "there", "here / there", "spread"), box=box.SIMPLE_HEAD, padding=0)
+    for name in [name for name in here if name in there]:
+        mine, theirs = ([one.value for one in found[name]] for found in (here, there))
+        ratios = [a / b for a, b in zip(mine, theirs, strict=True)]
+        table.add_row(name, spread(mine)[0], spread(theirs)[0], *spread(ratios))
     out.print(table)
-    parts = Table("part", "ms per simulated second", "spread", "share inside the engine")
-    for part in TIMED_PARTS:
-        inside = [d.engine_ms[part] / d.ms[part] for d in report.big if part in d.engine_ms]
-        parts.add_row(part, *spread([d.ms[part] for d in report.big]), spread(inside)[0] if inside else "")
-    out.print(parts)
-    around = f"{bench_street.VEHICLES} vehicles, robot, {bench_street.CAST} event pedestrians"
-    street = Table(f"step of the street: {around}", "median", "spread", "target")
-    for (persons, taken), target in zip(streets.items(), ("<= 1.0", "<= 2.0"), strict=True):
-        street.add_row(f"{persons} persons within 80 m, ms", *spread([one.ms for one in taken]), target)
-        street.add_row("  of it inside SUMO's step, ms", *spread([one.engine_ms for one in taken]), "")
-        street.add_row("  people shown", *spread([one.shown for one in taken]), "")
-    out.print(street)
-    places = Table("2 km city", "median", "spread", "target")
-    places.add_row("seed to street map, s", *spread([p.made_s for p in report.places]), "<= 4")
-    places.add_row("cache to street map, s", *spread([p.read_s for p in report.places]), "<= 0.5")
-    places.add_row("point in walkable area, us", *spread([p.contains_us for p in report.places]), "<= 5")
-    places.add_row("distance to its edge, us", *spread([p.distance_us for p in report.places]), "<= 20")
-    places.add_row("shortest walk, ms", *spread([p.walk_ms for p in report.places]), "<= 2")
-    out.print(places)
+    out.print(f"medians; a ratio a round, {rounds} in all, the checkouts in turns", highlight=False)
+
+
+def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
+    """A row per figure: the median of its rounds, the engine's own time, their ratio, and what should be reached."""
+    from scenarios.bench.figures import spread
+
+    heads = ("figure", "median", "spread", "limit", "ratio", "reach")
+    table = Table(*_columns(*heads), box=box.SIMPLE_HEAD, padding=0)
+    limits: dict[str, None] = {}
+    for name, rounds in found.items():
+        first, ratios = rounds[0], [one.ratio for one in rounds if one.ratio is not None]
+        limit = ratio = reach = mark = ""
+        if ratios:
+            limit, ratio = (spread(values)[0] for values in ([one.limit or 0.0 for one in rounds], ratios))
+            limits[first.limit_is] = None
+            mark = f" [{list(limits).index(first.limit_is) + 1}]"
+        if first.reach is not None:
+            reach = f"{'ratio' if first.reach_ratio else ''} {first.better} {first.reach:,.4g}".strip()
+        table.add_row(escape(name + mark), *spread([one.value for one in rounds]), limit, ratio, reach)
+    out.print(table)
+    for i, words in enumerate(limits):
+        out.print(f"limit [{i + 1}]: {words}", markup=False, highlight=False)
+
+
+def _columns(first: str, *others: str) -> list[Column]:
+    return [Column(first, overflow="fold"), *(Column(head, no_wrap=True, justify="right") for head in others)]
 
 
 def bench_cameras(rounds: int) -> None:
     """Measure the cameras in one busy street and print frames a second, targets and ratios."""
     from physics.cameras.choice import camera_of_choice, renderer_of
     from scenarios.bench.cameras import FIGURES, PERSONS, RATIOS, SIZE, time_cameras
-    from scenarios.bench.speed import spread
+    from scenarios.bench.figures import spread
 
     drawn_by = renderer_of(camera_of_choice("auto"))
     on_gpu = "llvmpipe" not in drawn_by and "bullet" not in drawn_by

@@ -38,7 +38,7 @@ class CosimError(Exception):
     ...     raise unknown("suite", "long-horizont", ["long-horizon", "reactive"])
     ... except CosimError as error:
     ...     print(error.exit_code, error)
-    2 unknown suite 'long-horizont'. Valid choices: long-horizon, reactive.
+    2 unknown suite 'long-horizont'. Valid choices: long-horizon, reactive. Did you mean long-horizon?
     """
 
     exit_code: ClassVar[int] = BROKEN_MACHINE
@@ -98,8 +98,9 @@ def unwritable(path: Path, error: OSError, remedy: str = "choose another place, 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
     """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x", ["unit"])."""
     valid = sorted(choices)
+    near = get_close_matches(name, valid, n=5, cutoff=0.5)
+    listed = ", ".join(valid) or "none"
     if len(valid) > MOST_LISTED:
-        near = get_close_matches(name, valid, n=5, cutoff=0.5)
-        listed = ", ".join(sorted(near) or valid[:5])
-        return UsageError(f"unknown {what} '{name}'. Valid choices: {len(valid)}, among them {listed}.")
-    return UsageError(f"unknown {what} '{name}'. Valid choices: {', '.join(valid) or 'none'}.")
+        listed = f"{len(valid)}, among them {', '.join(sorted(near) or valid[:5])}"
+    meant = f" Did you mean {near[0]}?" if near else ""
+    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed}.{meant}")

@@ -149,7 +149,7 @@ def _median(draw: Callable[[Street], object], streets: tuple[Street, ...]) -> fl
     return float(statistics.median(np.diff(stamps)[len(streets) // 10 :].tolist()))
 
 
-class Figure(NamedTuple):
+class Drawing(NamedTuple):
     """A row of the table. work(size_m) -> seconds a picture; least_fps: what it should reach, here and on a GPU."""
 
     name: str
@@ -165,13 +165,13 @@ EGL: Final = "whole frame, bullet (EGL plugin)"
 _SMALL: Final = "whole frame, gl, 0.2 km city"
 
 FIGURES: Final = (
-    Figure(WHOLE, partial(whole_frame, "gl", PERSONS, 120), least_fps=(100.0, 1000.0)),
-    Figure(PEOPLE, partial(people_alone, PERSONS, 200), least_fps=(PAPER_FPS, 10.0 * PAPER_FPS)),
-    Figure(TINY, partial(whole_frame, "bullet", PERSONS, 20)),
-    Figure(EGL, partial(whole_frame, "bullet-egl", PERSONS, 20)),
-    Figure(_SMALL, partial(whole_frame, "gl", PERSONS, 120), 200.0),
-    Figure(f"whole frame, gl, {CROWDED} people", partial(whole_frame, "gl", CROWDED, 60), least_fps=(None, 500.0)),
-    Figure(f"{TOGETHER} environments in an atlas, gl", partial(together, TOGETHER, 40), least_fps=(None, 5000.0)),
+    Drawing(WHOLE, partial(whole_frame, "gl", PERSONS, 120), least_fps=(100.0, 1000.0)),
+    Drawing(PEOPLE, partial(people_alone, PERSONS, 200), least_fps=(PAPER_FPS, 10.0 * PAPER_FPS)),
+    Drawing(TINY, partial(whole_frame, "bullet", PERSONS, 20)),
+    Drawing(EGL, partial(whole_frame, "bullet-egl", PERSONS, 20)),
+    Drawing(_SMALL, partial(whole_frame, "gl", PERSONS, 120), 200.0),
+    Drawing(f"whole frame, gl, {CROWDED} people", partial(whole_frame, "gl", CROWDED, 60), least_fps=(None, 500.0)),
+    Drawing(f"{TOGETHER} environments in an atlas, gl", partial(together, TOGETHER, 40), least_fps=(None, 5000.0)),
 )
 
 
@@ -190,9 +190,9 @@ class _Found(NamedTuple):
     why: str = ""
 
 
-def time_cameras(rounds: int, tell: Callable[[str], None], figures: Sequence[Figure] = FIGURES) -> dict[str, _Found]:
+def time_cameras(rounds: int, tell: Callable[[str], None], figures: Sequence[Drawing] = FIGURES) -> dict[str, _Found]:
     """Frames a second of every figure, `rounds` times, each in a fresh process. What fails is not tried again."""
-    from scenarios.bench.speed import alone
+    from scenarios.bench.alone import alone
 
     found = {figure.name: _Found([]) for figure in figures}
     for i in range(rounds):

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from scenarios.bench import cameras as bench_cameras
-from scenarios.bench.cameras import Figure, time_cameras, whole_frame
+from scenarios.bench.cameras import Drawing, time_cameras, whole_frame
 from tests.conftest import Cosim
 
 pytestmark = pytest.mark.engine
@@ -22,11 +22,11 @@ def test_what_cannot_be_drawn_is_told_with_its_reason(
     """No OpenGL, a package that is missing, a process that dies: each figure has its words; others are taken."""
     monkeypatch.setenv("__EGL_VENDOR_LIBRARY_DIRS", str(tmp_path))
     figures = (
-        Figure("by gl", partial(whole_frame, "gl", 3, 2), 200.0),
-        Figure("by a package", partial(importlib.import_module, "nowhere"), ""),  # type: ignore[arg-type]
-        Figure("by who dies", os._exit, 3),
-        Figure("by gl again", partial(whole_frame, "gl", 3, 2), 200.0),
-        Figure("by bullet", partial(whole_frame, "bullet", 3, 2), 200.0),
+        Drawing("by gl", partial(whole_frame, "gl", 3, 2), 200.0),
+        Drawing("by a package", partial(importlib.import_module, "nowhere"), ""),  # type: ignore[arg-type]
+        Drawing("by who dies", os._exit, 3),
+        Drawing("by gl again", partial(whole_frame, "gl", 3, 2), 200.0),
+        Drawing("by bullet", partial(whole_frame, "bullet", 3, 2), 200.0),
     )
     found = time_cameras(2, lambda _: None, figures)
     assert [len(found[figure.name].fps) for figure in figures] == [0, 0, 0, 0, 2]

@@ -1,0 +1,50 @@
+"""How long it takes until the first picture: in a fresh process, and from one episode to the next."""
+
+from __future__ import annotations
+
+import time
+from typing import Final
+
+from cosim.spec.scenario import City, Scenario
+from scenarios.bench.driving import FourHertz
+from scenarios.bench.figures import Figure
+
+ENGINES_ALONE: Final = "the engines alone, fresh process, s"
+
+
+def starting(began_s: float) -> list[Figure]:
+    """Seconds to the first frame of three scenarios in turn: in this process, fresh at `began_s` of the monotonic
+    clock; in the same city; in another one. Their cities are in the cache."""
+    from scenarios.catalog import load_suite
+
+    first, same, other = (load_suite("reactive").scenarios[i] for i in (0, 1, 8))
+    fresh_s = _first_frame_s(first, began_s)
+    same_s, other_s = (_first_frame_s(scenario, time.monotonic()) for scenario in (same, other))
+    return [
+        Figure("first frame, fresh process, cached city, s", fresh_s, reach=1.5),
+        Figure("first frame, next episode, same city, s", same_s, reach=0.3),
+        Figure("first frame, next episode, other cached city, s", other_s, reach=0.8),
+    ]
+
+
+def engines_starting(began_s: float) -> list[Figure]:
+    """Seconds until SUMO on the net of that first scenario, PyBullet and OpenGL alone stand in this process, fresh at
+    `began_s`."""
+    from physics.cameras.gl.context import context
+    from physics.world.bullet import p
+    from sumo_nets import engine
+    from sumo_nets.city.store import city_net
+
+    engine.start(["--net-file", str(city_net(City(seed=1))), "--no-step-log", "true", "--no-warnings", "true"])
+    engine.sumo.simulationStep()
+    p.connect(p.DIRECT)
+    with context():
+        return [Figure(ENGINES_ALONE, time.monotonic() - began_s)]
+
+
+def _first_frame_s(scenario: Scenario, began_s: float) -> float:
+    from scenarios.execution.episode import Episode
+
+    with Episode(scenario, FourHertz.manifest) as episode:
+        episode.reset()
+        return time.monotonic() - began_s
