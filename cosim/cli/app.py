@@ -279,6 +279,8 @@ def show(
 
     record = records[episode]
     print_episode(out, record)
+    if record.status != "done" and picture is not None:
+        raise UsageError(f"episode '{episode}' is {record.status}: it has no track to draw. Leave -o out")
     if record.status == "done":
         path = picture or folder / "episodes" / episode / "above.png"
         with doing(f"drawing {episode}"):

@@ -40,7 +40,7 @@ DAMAGE = {
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
 SAME = (
-    "suite", "robot", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
+    "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
     "versions", "renderer", "counterfactual",
 )  # fmt: skip
 """What makes two runs the same."""
@@ -49,10 +49,10 @@ SAME = (
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
     counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
-    that the policy is written in (`cosim.policies.load.source_hash`). robot: which one drives."""
+    that the policy is written in (`cosim.policies.load.source_hash`). robots: which drive, and the hash of each."""
 
     suite: str
-    robot: str
+    robots: dict[str, str]
     suite_version: str
     suite_hash: str
     policy: str

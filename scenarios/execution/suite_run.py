@@ -22,6 +22,7 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
+from physics.robots import hash_of_robot
 from scenarios.builders.fits import check_places
 from scenarios.catalog import load_suite, scenarios_chosen, with_robot
 from scenarios.execution.messages import Hello
@@ -85,13 +86,13 @@ def run(
 
 def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions) -> RunSpec:
     """What a run is, for its folder. policy: its name. Raises UsageError when a robot has no mount for its camera."""
-    manifest, robots = driver.manifest, sorted({scenario.robot for scenario in picked})
+    manifest, robots = driver.manifest, [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
-            manifest.camera.on(robot_called(robot))
+            manifest.camera.on(robot)
     return RunSpec(
         suite=whole.name,
-        robot=", ".join(robots),
+        robots={robot.name: hash_of_robot(robot) for robot in robots},
         suite_version=whole.version,
         suite_hash=whole.content_hash,
         policy=policy,

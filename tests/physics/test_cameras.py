@@ -47,7 +47,7 @@ def test_gl_without_opengl_names_the_packages(without_opengl: None) -> None:
 def test_a_run_does_not_mix_renderers(tmp_path: Path) -> None:
     """Resuming with another renderer is refused, and the message names both."""
     spec = RunSpec(
-        suite="s", robot="courier",
+        suite="s", robots={"courier": "h"},
         suite_version="1", suite_hash="h", policy="p", policy_name="p", policy_version="1", scenarios=(),
         versions={}, renderer="bullet-tiny",
     )  # fmt: skip

@@ -20,6 +20,7 @@ from cosim.records.record import Record
 from cosim.records.results import summary_of, table_of
 from cosim.records.run_folder import RunFolder, RunSpec, read_records, read_spec
 from cosim.spec.scenario import City, Scenario, Suite
+from tests.conftest import Cosim
 
 
 def scenario(name: str) -> Scenario:
@@ -31,7 +32,7 @@ def scenario(name: str) -> Scenario:
 
 SUITE = Suite(name="s", version="1", scenarios=tuple(scenario(f"s-{i}") for i in range(3)))
 SPEC = RunSpec(
-    suite="s", robot="courier",
+    suite="s", robots={"courier": "h"},
     suite_version="1", suite_hash=SUITE.content_hash, policy="p", policy_name="p", policy_version="1",
     scenarios=tuple(s.id for s in SUITE.scenarios), versions={"numpy": "2"},
 )  # fmt: skip
@@ -312,3 +313,13 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
     (tmp_path / "broken.npz").write_bytes((tmp_path / "t.npz").read_bytes()[:100])
     with pytest.raises(RunError, match=r"broken\.npz: not a trajectory"):
         Log.load(tmp_path / "broken.npz")
+
+
+def test_a_crashed_episode_has_no_picture(tmp_path: Path, cosim: Cosim) -> None:
+    """Asked for one, `cosim show` refuses in words; without, it tells what became of the episode."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE) as held:
+        held.keep(record("s-0", status="crashed"))
+    said = cosim("show", "run", "--episode", "s-0", "-o", "above.png", cwd=tmp_path)
+    assert said.returncode == 2 and "episode 's-0' is crashed: it has no track to draw" in said.stderr
+    assert not (tmp_path / "above.png").exists()
+    assert cosim("show", "run", "--episode", "s-0", cwd=tmp_path).returncode == 0

@@ -116,7 +116,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     manifest = driver.manifest
     spec = RunSpec(
         suite="s",
-        robot="courier",
+        robots={"courier": "h"},
         suite_version="1",
         suite_hash=short.content_hash,
         policy="orca",

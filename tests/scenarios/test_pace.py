@@ -113,7 +113,7 @@ def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
 
 def run_of(path: Path) -> RunFolder:
     spec = RunSpec(
-        suite="s", robot="courier",
+        suite="s", robots={"courier": "h"},
         suite_version="1", suite_hash="", policy="route", policy_name="route", policy_version="1",
         scenarios=tuple(s.id for s in LONG), versions=versions(), renderer=GL,
     )  # fmt: skip

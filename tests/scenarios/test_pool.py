@@ -205,7 +205,7 @@ def all_pooled(folder: Path, scenarios: tuple[Scenario, ...], *fakes: Fake, **na
         load_policy("stop"),
     )
     spec = RunSpec(
-        suite="s", robot="courier",
+        suite="s", robots={"courier": "h"},
         suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
         scenarios=tuple(one.id for one in scenarios), versions={},
     )  # fmt: skip

@@ -34,7 +34,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid
 from cosim.spec.scenario import Suite, content_hash
 from physics.cameras.view import robot_shot
-from physics.robots import urdf_of
+from physics.robots import hash_of_robot, urdf_of
 from physics.world.drive import SkidDrive
 from physics.world.street_surface import StreetSurface
 from scenarios.builders.barriers import fenced
@@ -207,7 +207,7 @@ def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(barrow: Ro
     assert not (tmp_path / "run").exists()
     whole = with_robot(load_suite("reactive"), barrow.name)
     spec = run_spec(whole, whole.scenarios[:1], "p", Driver.of(policy), EpisodeOptions(camera="bullet"))
-    assert spec.robot == "barrow"
+    assert spec.robots == {"barrow": hash_of_robot(barrow)}
 
 
 def test_a_barrier_stands_across_the_route_of_a_wider_robot(barrow: Robot) -> None:
@@ -229,13 +229,25 @@ def test_another_robot_is_another_suite_and_another_run(tmp_path: Path) -> None:
     assert content_hash(whole.scenarios[0]) != content_hash(shipped.scenarios[0])
     assert with_robot(shipped, "courier") is with_robot(shipped, "") is shipped
     spec = RunSpec(
-        suite="s", robot="courier", suite_version="1", suite_hash="h", policy="p", policy_name="p", policy_version="1",
-        scenarios=(), versions={},
+        suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="p", policy_name="p",
+        policy_version="1", scenarios=(), versions={},
     )  # fmt: skip
     with RunFolder.create(tmp_path / "run", spec, Suite(name="s", version="1", scenarios=())):
         pass
-    with pytest.raises(RunError, match="its robot is courier, now asked for is scout"):
-        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(spec, robot="scout", suite_hash="other"))
+    with pytest.raises(RunError, match=r"its robots is \{'courier': 'h', 'scout': None\}, now asked"):
+        RunFolder.resume(tmp_path / "run", msgspec.structs.replace(spec, robots={"scout": "h"}, suite_hash="other"))
+
+
+def test_an_edited_robot_is_another_one(barrow: Robot, tmp_path: Path) -> None:
+    """A number of its row and a word of its URDF are in its hash, which a resumed run is held against."""
+    again = dataclasses.replace(barrow, urdf=str(tmp_path / "again.urdf"))
+    Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes())
+    as_it_was = hash_of_robot(again)
+    assert (
+        hash_of_robot(dataclasses.replace(again, v_max_mps=again.v_max_mps + 0.1)) != as_it_was == hash_of_robot(again)
+    )
+    Path(again.urdf).write_bytes(urdf_of(barrow).read_bytes() + b"<!-- heavier -->")
+    assert hash_of_robot(again) != as_it_was
 
 
 def test_a_robot_that_is_not_there_is_refused_with_those_that_are(cosim: Cosim, tmp_path: Path) -> None:
