@@ -130,10 +130,11 @@ def together(environments: int, frames: int, size_m: float) -> float:
     world = world_of(StreetSurface(street_map, 5))
     busy = busy_street(street_map, PERSONS, frames)
     spec = CameraSpec(*SIZE, fov_deg=60.0)
-    with Atlas([world] * environments, spec) as eyes:
+    with Atlas(spec) as eyes:
+        keys = [eyes.join(world) for _ in range(environments)]
 
         def draw(street: Street) -> None:
-            eyes.begin([(busy.robot, street)] * environments)
+            eyes.begin([(key, busy.robot, street) for key in keys])
             if street.tick:
                 eyes.end()
 

@@ -6,7 +6,11 @@ import numpy as np
 import pytest
 
 from cosim.core.errors import EngineError, UsageError
+from cosim.core.geometry import Pose
+from cosim.core.state import Frame, RobotState, Street
 from cosim.episode.ports import CameraSpec
+from cosim.spec.robot import ROBOTS
+from cosim.spec.scenario import Light
 from physics.cameras.gl import context
 from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
@@ -18,33 +22,76 @@ pytestmark = [
 ]
 
 SPEC = CameraSpec(96, 54, fov_deg=60.0)
+NOON = Light()
 
 
-def test_an_atlas_holds_the_pictures_of_its_cameras() -> None:
-    """Three environments drawn at once, with a second picture under way before the first is read: bit for bit what
+@pytest.fixture(scope="module")
+def worlds() -> list[BulletWorld]:
+    return [BulletWorld(StreetSurface(camera_city(300.0), seed)) for seed in (1, 2, 3)]
+
+
+def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -> None:
+    """Three environments drawn at once, with a second batch under way before the first is read: bit for bit what
     three cameras draw one by one."""
     from physics.cameras.gl.atlas import Atlas
-    from physics.cameras.gl.camera import GlCamera
 
-    street_map = camera_city(300.0)
-    worlds = [BulletWorld(StreetSurface(street_map, seed)) for seed in (1, 2, 3)]
-    busy = busy_street(street_map, 8, 5)
+    busy = busy_street(camera_city(300.0), 8, 5)
     ticks = [[busy.streets[i + k] for k in range(3)] for i in range(2)]
-    single = []
-    for k, world in enumerate(worlds):
-        with GlCamera(world, SPEC) as camera:
-            single.append([camera.render(busy.robot, streets[k]) for streets in ticks])
-    with Atlas(worlds, SPEC) as atlas:
+    single = [_alone(world, NOON, [(busy.robot, streets[k]) for streets in ticks]) for k, world in enumerate(worlds)]
+    with Atlas(SPEC) as atlas:
+        keys = [atlas.join(world) for world in worlds]
         for streets in ticks:
-            atlas.begin([(busy.robot, street) for street in streets])
+            atlas.begin([(key, busy.robot, street) for key, street in zip(keys, streets, strict=True)])
         with pytest.raises(EngineError, match="under way"):
-            atlas.begin([(busy.robot, street) for street in ticks[0]])
+            atlas.begin([(keys[0], busy.robot, busy.streets[0])])
         together = [atlas.end() for _ in ticks]
     for k in range(3):
         for i in range(2):
-            assert np.array_equal(together[i][k].rgb, single[k][i].rgb)
-            assert np.array_equal(together[i][k].labels, single[k][i].labels)
+            assert _same(together[i][k], single[k][i])
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
+
+
+def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld]) -> None:
+    """Whoever else is in it, before, beside or after: an environment of a place, light and robot of its own has the
+    pictures of a camera of its own, in the order asked for, also one that left before its picture was fetched."""
+    from physics.cameras.gl.atlas import Atlas
+
+    busy = busy_street(camera_city(300.0), 8, 4)
+    near = worlds[0].robot
+    tall = next(robot for robot in ROBOTS.values() if robot.name != near.name)
+    other = BulletWorld(StreetSurface(camera_city(300.0), 2), robot=tall)
+    lights = [NOON, Light(hour=22.0), Light(shadows=False, fog_m=40.0)]
+    asked = [(busy.robot, street) for street in busy.streets]
+    seats = list(zip((worlds[0], other, worlds[2]), lights, strict=True))
+    a, b, c = (_alone(world, light, asked) for world, light in seats)
+    with Atlas(SPEC) as atlas:
+        first, second = (atlas.join(*seat) for seat in seats[:2])
+        found = atlas.render([(second, *asked[0]), (first, *asked[0])])
+        assert _same(found[0], b[0]) and _same(found[1], a[0])
+        third = atlas.join(*seats[2])
+        atlas.begin([(first, *asked[1]), (third, *asked[1]), (second, *asked[2])])
+        atlas.leave(first)
+        atlas.begin([(third, *asked[2])])
+        for one, expected in zip(atlas.end() + atlas.end(), (a[1], c[1], b[2], c[2]), strict=True):
+            assert _same(one, expected)
+        with pytest.raises(UsageError, match=f"environment {first} is not in the atlas; in it are: {second}, {third}"):
+            atlas.begin([(first, *asked[3])])
+        again = atlas.join(*seats[0])
+        assert again not in (first, second, third)
+        assert all(map(_same, atlas.render([(k, *asked[3]) for k in (again, third)]), (a[3], c[3])))
+        assert atlas.render([]) == []
+
+
+def _alone(world: BulletWorld, light: Light, asked: list[tuple[RobotState, Street]]) -> list[Frame]:
+    from physics.cameras.gl.camera import GlCamera
+
+    with GlCamera(world, SPEC, light=light) as camera:
+        return [camera.render(robot, street) for robot, street in asked]
+
+
+def _same(one: Frame, other: Frame) -> bool:
+    assert one.labels is not None and other.labels is not None
+    return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
 
 
 def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
@@ -67,10 +114,12 @@ def test_people_alone_are_the_same_with_the_next_picture_under_way() -> None:
     assert not np.array_equal(found[0].rgb, found[2].rgb)
 
 
-def test_an_atlas_too_large_is_refused_with_the_limit() -> None:
-    """More rows than a texture may have."""
+def test_an_atlas_too_large_is_refused_with_the_limit(worlds: list[BulletWorld]) -> None:
+    """More rows than a texture may have; and an atlas that is not running says so."""
     from physics.cameras.gl.atlas import Atlas
 
-    world = BulletWorld(StreetSurface(camera_city(300.0), 1))
-    with pytest.raises(UsageError, match="1 to 16 fit"):
-        Atlas([world] * 17, CameraSpec(64, 1024))
+    atlas = Atlas(CameraSpec(64, 1024))
+    with pytest.raises(EngineError, match="'with' block"):
+        atlas.join(worlds[0])
+    with atlas, pytest.raises(UsageError, match="1 to 16 fit"):
+        atlas.begin([(atlas.join(worlds[0]), RobotState(Pose(0.0, 0.0, 0.0)), Street(0))] * 17)

@@ -1,5 +1,6 @@
-"""Atlas: the robots of many environments in one process, drawn one after the other and read back at once.
+"""Atlas: the robots of many environments in one process, drawn together and read back at once.
 
+Environments join and leave at any time, each with a place, a light and a robot of its own; a batch holds any of them.
 The pictures are those of a `GlCamera` each, bit for bit: each is drawn by itself and copied behind the last into one
 buffer on the graphics card. Waiting for that buffer is what costs there; one is waited for while the next is under
 way: `begin` the next pictures before you `end` the last ones.
@@ -9,9 +10,9 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from contextlib import ExitStack
+from itertools import count
 from types import TracebackType
-from typing import Self
+from typing import NewType, Self
 
 import moderngl
 
@@ -26,65 +27,96 @@ from physics.cameras.lens import drawn
 from physics.cameras.view import SIDE_MAX
 from physics.world.world import BulletWorld
 
-_Seen = Sequence[tuple[RobotState, Street]]
-"""A robot and its street for each environment."""
+SeatKey = NewType("SeatKey", int)
+"""Names an environment of an atlas, from `join` to `leave`; no other one ever gets it."""
+_Seen = Sequence[tuple[SeatKey, RobotState, Street]]
+"""An environment, its robot and its street, for each picture."""
 
 
 class Atlas:
-    """One camera for several worlds. Use it in a `with` block. Raises UsageError when the atlas would be too large."""
+    """One camera for several worlds. Use it in a `with` block."""
 
-    def __init__(self, worlds: Sequence[BulletWorld], spec: CameraSpec, light: Light = NOON) -> None:
+    def __init__(self, spec: CameraSpec) -> None:
+        self._spec = spec
         self._size = drawn(spec).width, drawn(spec).height
-        if not worlds or len(worlds) * self._size[1] > 4 * SIDE_MAX:
-            raise UsageError(
-                f"an atlas of {len(worlds)} pictures of {self._size[1]} rows: 1 to {4 * SIDE_MAX // self._size[1]} fit"
-            )
-        self._cameras = [GlCamera(world, spec, light=light) for world in worlds]
-        self._running = ExitStack()
-        self._begun: deque[_Seen] = deque()
+        self._most = 4 * SIDE_MAX // self._size[1]
+        self._cameras: dict[SeatKey, GlCamera] = {}
+        self._keys = count()
+        self._begun: deque[list[tuple[GlCamera, RobotState, Street]]] = deque()
         self._context: moderngl.Context | None = None
 
     def __enter__(self) -> Self:
-        for camera in self._cameras:
-            self._running.enter_context(camera)
         with context() as gl:
-            self._target, self._readback = Target(gl, self._size), Readback(gl, self._size, len(self._cameras))
+            self._target, self._readback = Target(gl, self._size), Readback(gl, self._size)
         self._context = gl
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        while self._cameras:
+            self._cameras.popitem()[1].close()
         if self._context is not None:
             with self._context:
                 self._target.release()
                 self._readback.release()
             self._context = None
-        self._running.close()
+
+    def join(self, world: BulletWorld, light: Light = NOON) -> SeatKey:
+        """Take an environment in; the world need not be running."""
+        self._running_context  # noqa: B018  an atlas that is not running says so
+        camera = GlCamera(world, self._spec, light=light)
+        key = SeatKey(next(self._keys))
+        self._cameras[key] = camera.__enter__()
+        return key
+
+    def leave(self, key: SeatKey) -> None:
+        """Free what an environment holds. Its pictures under way are handed over all the same."""
+        self._camera(key).close()
+        del self._cameras[key]
 
     def render(self, seen: _Seen) -> list[Frame]:
-        """What every robot sees, in the order of the worlds."""
+        """What these robots see, in this order."""
         self.begin(seen)
         return self.end()
 
     def begin(self, seen: _Seen) -> None:
-        """Draw what every robot sees; `end` hands the pictures over."""
-        with self._running_context:
-            self._readback.begin()
-            for i, (camera, (robot, street)) in enumerate(zip(self._cameras, seen, strict=True)):
-                self._target.clear()
-                camera.draw_into(self._target, robot, street)
-                self._readback.copy(self._target, i)
-        self._begun.append(seen)
+        """Draw what these robots see; `end` hands the pictures over.
+
+        Raises UsageError for an environment that is not in the atlas, and where there are too many pictures.
+        """
+        gl = self._running_context
+        if len(seen) > self._most:
+            raise UsageError(
+                f"an atlas of {len(seen)} pictures of {self._size[1]} rows: 1 to {self._most} fit at a time"
+            )
+        batch = [(self._camera(key), robot, street) for key, robot, street in seen]
+        with gl:
+            self._readback.begin(len(batch))
+            try:
+                for i, (camera, robot, street) in enumerate(batch):
+                    self._target.clear()
+                    camera.draw_into(self._target, robot, street)
+                    self._readback.copy(self._target, i)
+            except BaseException:
+                self._readback.forget()
+                raise
+        self._begun.append(batch)
 
     def end(self) -> list[Frame]:
-        """The pictures that began first and have not ended."""
+        """The pictures that began first and have not ended, in the order in which they were asked for."""
         with self._running_context:
             pictures = self._readback.end()
         return [
             camera.through_lens(Frame(*picture), robot, street)
-            for camera, picture, (robot, street) in zip(self._cameras, pictures, self._begun.popleft(), strict=True)
+            for picture, (camera, robot, street) in zip(pictures, self._begun.popleft(), strict=True)
         ]
+
+    def _camera(self, key: SeatKey) -> GlCamera:
+        if key not in self._cameras:
+            known = ", ".join(map(str, self._cameras)) or "none"
+            raise UsageError(f"environment {key} is not in the atlas; in it are: {known}")
+        return self._cameras[key]
 
     @property
     def _running_context(self) -> moderngl.Context:

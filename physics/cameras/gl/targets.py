@@ -59,33 +59,41 @@ class Readback:
     UNDER_WAY: Final = 2
     """Buffers that may have begun and not ended."""
 
-    def __init__(self, context: moderngl.Context, size: tuple[int, int], pictures: int = 1) -> None:
-        self._size, self._pictures = size, pictures
+    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
+        self._context, self._size = context, size
         self._each = size[0] * size[1] * 4
-        self._free = [context.buffer(reserve=self._each * pictures) for _ in range(self.UNDER_WAY)]
-        self._begun: deque[moderngl.Buffer] = deque()
+        self._free = [context.buffer(reserve=self._each) for _ in range(self.UNDER_WAY)]
+        self._begun: deque[tuple[moderngl.Buffer, int]] = deque()
 
-    def begin(self) -> None:
-        """Take a buffer for what is copied next."""
+    def begin(self, pictures: int = 1) -> None:
+        """Take a buffer for so many pictures, which are copied next."""
         if not self._free:
             raise EngineError("too many pictures are under way: `end` some first")
-        self._begun.append(self._free.pop())
+        buffer = self._free.pop()
+        if buffer.size < pictures * self._each:
+            buffer.release()
+            buffer = self._context.buffer(reserve=pictures * self._each)
+        self._begun.append((buffer, pictures))
 
     def copy(self, target: Target, place: int = 0) -> None:
         """Let the card copy a target to a place in the buffer that began last."""
-        target.frame.read_into(self._begun[-1], components=4, dtype="f1", write_offset=place * self._each)
+        target.frame.read_into(self._begun[-1][0], components=4, dtype="f1", write_offset=place * self._each)
+
+    def forget(self) -> None:
+        """Give the buffer that began last back: its pictures could not be drawn."""
+        self._free.append(self._begun.pop()[0])
 
     def end(self) -> list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
         """The pictures of the buffer that began first, as `Target.read` gives them."""
         if not self._begun:
             raise EngineError("no picture is under way: `begin` one first")
-        buffer = self._begun.popleft()
-        data = memoryview(buffer.read())
+        buffer, pictures = self._begun.popleft()
         self._free.append(buffer)
-        return [parted(data[i * self._each : (i + 1) * self._each], self._size) for i in range(self._pictures)]
+        data = memoryview(buffer.read(pictures * self._each)) if pictures else memoryview(b"")
+        return [parted(data[i * self._each : (i + 1) * self._each], self._size) for i in range(pictures)]
 
     def release(self) -> None:
-        for buffer in (*self._free, *self._begun):
+        for buffer in (*self._free, *(buffer for buffer, _ in self._begun)):
             buffer.release()
 
 
