@@ -10,16 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import People
+from cosim.core.state import Doing, People
 from cosim.people.gait import PACES_MPS, first_stride, relative_pace, stature_m
 from physics.people.clips import Clips, own_clips
 from physics.people.families import FAMILIES, Family
+from physics.people.gestures import GESTURES
 from physics.people.looks import family_of
 
 _PACES: Final = np.array(PACES_MPS)
 _APART: Final = np.diff(_PACES)
 _STANDING_MPS: Final = (0.04, PACES_MPS[0])
 """Between these paces a gesture turns into the slowest walk."""
+_LOOPS: Final = {name: row for row, name in enumerate(GESTURES)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,16 +46,21 @@ def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
     Who walks is drawn between the two strides of the paces around theirs, at the phase of the strides they took; who
     stands does what `people.doing` says; in between, as one starts or stops, the one turns into the other.
     """
-    clips = own_clips() if clips is None else clips
-    if not len(people):
-        return Poses(np.zeros((0, 4), np.intp), np.zeros((0, 4), np.float32), np.zeros(0))
-    family, stature, size, offset = _facts_of(people.ids, people.age.tobytes())
-    pace = relative_pace(people.pace, stature)
+    bodies, loops = bodies_of(people.ids, people.age.tobytes()), loops_of(people.doing)
+    return poses_of(bodies, people.pace, people.strides, loops, time_s, own_clips() if clips is None else clips)
+
+
+def poses_of(
+    bodies: Floats, pace: Floats, strides: Floats, loops: NDArray[np.intp], time_s: float | Floats, clips: Clips
+) -> Poses:
+    """The poses of N people, of any number of streets. bodies: (N, 4), of `bodies_of`; pace, strides: (N,), as in
+    `People`; loops: (N,), of `loops_of`; time_s: of all or (N,)."""
+    family, stature, size, offset = bodies[:, 0].astype(np.intp), bodies[:, 1], bodies[:, 2], bodies[:, 3]
+    pace = relative_pace(pace, stature)
     knot = _PACES[1:-1].searchsorted(pace, side="right")
     faster = np.minimum(np.maximum((pace - _PACES[knot]) / _APART[knot], 0.0), 1.0)
-    slow = (pace < _PACES[0]).nonzero()[0]
 
-    frame, frames = people.strides % 1.0 * clips.stride_frames, clips.stride_frames
+    frame, frames = strides % 1.0 * clips.stride_frames, clips.stride_frames
     low = np.minimum(frame.astype(np.intp), frames - 1)
     late = frame - low
     first, second = clips.gaits[family, knot], clips.gaits[family, knot + 1]
@@ -63,46 +70,39 @@ def poses(people: People, time_s: float, clips: Clips | None = None) -> Poses:
     early, slower = 1.0 - late, 1.0 - faster
     weights[:, 0], weights[:, 1] = early * slower, late * slower
     weights[:, 2], weights[:, 3] = early * faster, late * faster
+
+    slow = (pace < _PACES[0]).nonzero()[0]
     if len(slow):
-        _standing(people, time_s, clips, slow, family, pace, offset, rows, weights)
+        # Who is on the spot: the second half of the frames is a gesture.
+        start, end = _STANDING_MPS
+        share = np.minimum(np.maximum((pace[slow] - start) / (end - start), 0.0), 1.0)
+        walk = share * share * (3.0 - 2.0 * share)
+        now_s = time_s[slow] if isinstance(time_s, np.ndarray) else time_s
+        frame = (now_s / clips.loop_s + offset[slow]) % 1.0 * clips.loop_frames
+        low = np.minimum(frame.astype(np.intp), clips.loop_frames - 1)
+        late = frame - low
+        first = np.array([clips.gestures[name] for name in GESTURES])[loops[slow], family[slow]]
+        rows[slow, 2], rows[slow, 3] = first + low, first + (low + 1) % clips.loop_frames
+        weights[slow, :2] *= walk[:, None]
+        weights[slow, 2], weights[slow, 3] = (1.0 - walk) * (1.0 - late), (1.0 - walk) * late
     return Poses(rows, weights.astype(np.float32), size)
 
 
-def _standing(
-    people: People,
-    time_s: float,
-    clips: Clips,
-    slow: NDArray[np.intp],
-    family: NDArray[np.intp],
-    pace: Floats,
-    offset: Floats,
-    rows: NDArray[np.intp],
-    weights: Floats,
-) -> None:
-    """Let those in (M,) rows `slow` do what they do on the spot: the second half of their frames is a gesture."""
-    start, end = _STANDING_MPS
-    share = np.minimum(np.maximum((pace[slow] - start) / (end - start), 0.0), 1.0)
-    walk = share * share * (3.0 - 2.0 * share)
-    frame = (time_s / clips.loop_s + offset[slow]) % 1.0 * clips.loop_frames
-    low = np.minimum(frame.astype(np.intp), clips.loop_frames - 1)
-    late = frame - low
-    doing = [people.doing[i] for i in slow.tolist()]
-    names = [clips.gestures["stand" if what == "walk" else what] for what in doing]
-    first = np.array([row[k] for row, k in zip(names, family[slow].tolist(), strict=True)])
-    rows[slow, 2], rows[slow, 3] = first + low, first + (low + 1) % clips.loop_frames
-    weights[slow, :2] *= walk[:, None]
-    weights[slow, 2], weights[slow, 3] = (1.0 - walk) * (1.0 - late), (1.0 - walk) * late
+@lru_cache(maxsize=256)
+def loops_of(doing: tuple[Doing, ...]) -> NDArray[np.intp]:
+    """(N,) rows in GESTURES of what people do when they are on the spot."""
+    return np.array([_LOOPS["stand" if what == "walk" else what] for what in doing], dtype=np.intp)
 
 
-@lru_cache(maxsize=32)
-def _facts_of(names: tuple[str, ...], ages: bytes) -> tuple[NDArray[np.intp], Floats, Floats, Floats]:
-    facts = np.array([_facts(name, age) for name, age in zip(names, ages, strict=True)])
-    return facts[:, 0].astype(np.intp), facts[:, 1], facts[:, 2], facts[:, 3]
+@lru_cache(maxsize=256)
+def bodies_of(names: tuple[str, ...], ages: bytes) -> Floats:
+    """(N, 4) of each person: row of the family, stature in metres, factor on the family's body, where in a loop it is
+    at time 0."""
+    return np.array([_body_of(name, age) for name, age in zip(names, ages, strict=True)]).reshape(-1, 4)
 
 
 @lru_cache(maxsize=65536)
-def _facts(name: str, age: int) -> tuple[float, float, float, float]:
-    """Row of the family, stature m, factor on the family's body, where in a loop the person is at time 0."""
+def _body_of(name: str, age: int) -> tuple[float, float, float, float]:
     family: Family = family_of(name, age)
     stature = stature_m(name, age)
     return float(FAMILIES.index(family)), stature, stature / _STATURES[family], first_stride(name)

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, Age, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
-from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing
+from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing, Watched
 from physics.cameras.gl.lighting import lighting_of
-from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
+from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
@@ -44,21 +46,26 @@ def street(seed: int, count: int = 50) -> People:
     return People.of(names, xy, rng.uniform(-3.0, 3.0, count), pace, tuple(doing), rng.uniform(0.0, 9.0, count))
 
 
+def flat(xy: Floats) -> Floats:
+    return np.zeros(len(xy))
+
+
 @contextmanager
 def drawing(crowd: CrowdDrawing, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
     gl, anchor = context(), anchor_of(taken.eye_m)
-    all_ = np.ones(len(people), dtype=bool)
-    crowd.set(people, 2.0, np.zeros(len(people)), taken, anchor, all_, all_)
-    block, target = SceneBlock(gl), Target(gl, taken.size)
-    block.write(camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1)))
+    crowd.set([Watched(people, 2.0, flat, shadows=True)], Shots([taken]))
+    blocks, target = SceneBlocks(gl), Target(gl, taken.size)
+    blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1)))
+    blocks.upload()
+    blocks.bind()
     target.frame.use()
     gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
     gl.front_face, gl.depth_func = "cw", "<"
     target.frame.clear(depth=1.0)
-    crowd.draw("colour")
+    crowd.draw("colour", shadows=False)
     yield target.read()
     target.release()
-    block.release()
+    blocks.release()
 
 
 def mask(crowd: CrowdDrawing, people: People, taken: Shot) -> NDArray[np.bool_]:
@@ -69,7 +76,7 @@ def mask(crowd: CrowdDrawing, people: People, taken: Shot) -> NDArray[np.bool_]:
 @pytest.fixture
 def crowd() -> Iterator[CrowdDrawing]:
     with context() as gl:
-        crowd = CrowdDrawing(gl, False)
+        crowd = CrowdDrawing(gl)
         yield crowd
         crowd.release()
 
@@ -79,7 +86,7 @@ def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch:
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     scenes = [street(seed) for seed in range(4)]
     levelled = [mask(crowd, people, taken) for people in scenes]
-    monkeypatch.setattr(crowds, "levels", lambda xy, z_m, taken: np.zeros(len(xy), dtype=np.intp))
+    monkeypatch.setattr(crowds, "levels", lambda shots, whose, xy, z_m: np.zeros(len(xy), dtype=np.intp))
     full = [mask(crowd, people, taken) for people in scenes]
     changed = sum(int((a ^ b).sum()) for a, b in zip(levelled, full, strict=True))
     total = sum(int(b.sum()) for b in full)
@@ -100,7 +107,7 @@ def test_each_level_is_like_full_detail_where_it_begins(
         people = People.of((f"c{i}",), [[0.0, 0.0]], [1.7 * i], [1.3 * (i % 3 > 0)], ("stand",), [0.37 * i], age=age)
         shown = []
         for forced in (level, 0):
-            monkeypatch.setattr(crowds, "levels", lambda xy, z_m, taken, k=forced: np.full(len(xy), k))
+            monkeypatch.setattr(crowds, "levels", lambda shots, whose, xy, z_m, k=forced: np.full(len(xy), k))
             shown.append(mask(crowd, people, taken))
         changed, total = changed + int((shown[0] ^ shown[1]).sum()), total + int(shown[1].sum())
     print(f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} % changed")
@@ -129,4 +136,4 @@ def test_nobody_is_drawn_as_nothing(crowd: CrowdDrawing) -> None:
     """Without people the picture stays empty, and drawing does no harm."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     assert not mask(crowd, street(0, 0), taken).any()
-    crowd.draw("moving")
+    crowd.draw("moving", shadows=True)

@@ -11,8 +11,8 @@ import trimesh
 
 from cosim.core.errors import EngineError, SpecError
 from cosim.spec.robot import COURIER
-from physics.cameras.gl.robot_body import robot_parts
 from physics.robots import urdf_of
+from physics.robots.robot_body import robot_parts
 
 CHASSIS = re.compile(r'<box size="([\d. ]+)"\s*/>')
 

@@ -9,13 +9,14 @@ import moderngl
 import numpy as np
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Pose
+from cosim.core.geometry import Floats, Pose
 from cosim.core.state import Frame, Street
 from cosim.spec.scenario import Light
 from physics.cameras.gl.context import context
-from physics.cameras.gl.crowd import CrowdDrawing
+from physics.cameras.gl.crowd import CrowdDrawing, Watched
 from physics.cameras.gl.lighting import lighting_of
-from physics.cameras.gl.shading import SceneBlock, anchor_of, camera_matrix
+from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
+from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.targets import Readback, Target
 from physics.cameras.sky import sky_of
 from physics.cameras.view import shot
@@ -33,7 +34,7 @@ class PeopleAlone:
 
     def __enter__(self) -> Self:
         with context() as gl:
-            self._crowd, self._block, self._target = CrowdDrawing(gl, False), SceneBlock(gl), Target(gl, self._size)
+            self._crowd, self._blocks, self._target = CrowdDrawing(gl), SceneBlocks(gl), Target(gl, self._size)
             self._readback = Readback(gl, self._size)
         self._context = gl
         return self
@@ -42,7 +43,7 @@ class PeopleAlone:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         with self._context:
-            for thing in (self._crowd, self._block, self._target, self._readback):
+            for thing in (self._crowd, self._blocks, self._target, self._readback):
                 thing.release()
 
     def render(self, pose: Pose, street: Street) -> Frame:
@@ -55,18 +56,17 @@ class PeopleAlone:
         ahead = np.array([np.cos(pose.heading_rad), np.sin(pose.heading_rad)])
         eye = np.append(pose.xy, EYE_M)
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
-        anchor, people = anchor_of(taken.eye_m), street.people
-        all_of_them, nobody = np.ones(len(people), dtype=bool), np.zeros(len(people), dtype=bool)
+        shots, anchor = Shots([taken]), anchor_of(taken.eye_m)
         with self._context as gl:
-            self._crowd.set(
-                people, Clock().time_s(street.tick), np.zeros(len(people)), taken, anchor, all_of_them, nobody
-            )
-            self._block.write(camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
+            self._crowd.set([Watched(street.people, Clock().time_s(street.tick), _flat, shadows=False)], shots)
+            self._blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
+            self._blocks.upload()
+            self._blocks.bind()
             self._target.clear()
             gl.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
             gl.front_face = "cw"
             gl.depth_func = "<"
-            self._crowd.draw("colour")
+            self._crowd.draw("colour", shadows=False)
             self._readback.begin()
             self._readback.copy(self._target)
 
@@ -74,3 +74,7 @@ class PeopleAlone:
         """The picture that began first and has not ended."""
         with self._context:
             return Frame(*self._readback.end()[0])
+
+
+def _flat(xy: Floats) -> Floats:
+    return np.zeros(len(xy))

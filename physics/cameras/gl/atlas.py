@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from itertools import count
 from types import TracebackType
 from typing import NewType, Self
@@ -20,6 +21,7 @@ from cosim.core.errors import EngineError, UsageError
 from cosim.core.state import Frame, RobotState, Street
 from cosim.episode.ports import CameraSpec
 from cosim.spec.scenario import Light
+from physics.cameras.gl.batch import batch_drawing
 from physics.cameras.gl.camera import NOON, GlCamera
 from physics.cameras.gl.context import context
 from physics.cameras.gl.targets import Readback, Target
@@ -91,13 +93,11 @@ class Atlas:
                 f"an atlas of {len(seen)} pictures of {self._size[1]} rows: 1 to {self._most} fit at a time"
             )
         batch = [(self._camera(key), robot, street) for key, robot, street in seen]
+        pictures = [camera.mounted_picture(robot, street) for camera, robot, street in batch]
         with gl:
             self._readback.begin(len(batch))
             try:
-                for i, (camera, robot, street) in enumerate(batch):
-                    self._target.clear()
-                    camera.draw_into(self._target, robot, street)
-                    self._readback.copy(self._target, i)
+                batch_drawing(gl).draw(pictures, self._target, partial(self._readback.copy, self._target))
             except BaseException:
                 self._readback.forget()
                 raise

@@ -28,7 +28,7 @@ def corners(mesh: Mesh, colour: ArrayLike, fourth: int) -> CornerRows:
 
 
 def joined_corners(parts: Sequence[tuple[Mesh, CornerRows]]) -> tuple[CornerRows, NDArray[np.uint32]]:
-    """The rows of several meshes after each other, and the indices of their triangles, flat."""
+    """The rows of several meshes, one at least, after each other, and the indices of their triangles, flat."""
     starts = np.cumsum([0, *(len(rows) for _, rows in parts)])
     indices = [(mesh.triangles + start).ravel() for (mesh, _), start in zip(parts, starts, strict=False)]
     return np.concatenate([rows for _, rows in parts]), np.concatenate(indices).astype(np.uint32)

@@ -1,15 +1,16 @@
-"""People for the gl camera: skinned bodies, posed on the graphics card.
+"""People for the gl camera: skinned bodies, posed on the graphics card, of all pictures of a batch at once.
 
-Per picture a few numbers per person go up: four baked frames with weights, place, heading, size. A first small pass
-blends the frames and writes everybody's 24 joint matrices, in metres from the anchor, into a texture; the vertex
-shaders of all passes skin with them. Bodies of all outfits and levels lie in one buffer; a pass is one indirect draw
-for those near (four joints per vertex) and one for those far away (two).
+Per batch a few numbers per person go up: four baked frames with weights, place, heading, size. A first small pass
+blends the frames and writes everybody's 24 joint matrices, in metres from the picture's anchor, into a texture; the
+vertex shaders of all passes skin with them. Bodies of all outfits and levels lie in one buffer; a pass of a picture is
+one indirect draw for those near (four joints per vertex) and one for those far away (two).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import moderngl
 import numpy as np
@@ -17,23 +18,29 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
+from physics.cameras.gl.instances import runs_of
 from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.skins import mesh_skins, tube_skins
-from physics.cameras.view import Shot
+from physics.cameras.view import PERSON_MARGIN_M
 from physics.people.body import COATS, body, far_body
 from physics.people.clips import own_clips
 from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.looks import ALL, look_of
-from physics.people.poses import poses
+from physics.people.poses import bodies_of, loops_of, poses_of
 
 LEVEL_PX: Final = (170.0, 56.0, 22.0)
 """Drawn height of a body, in pixels, below which the next coarser level is taken."""
+CAST_M: Final = 18.0
+"""How far from the eye people throw shadows."""
 
-_INSTANCE: Final = np.dtype([("person", "i4"), ("girth", "f4")])
+_INSTANCE: Final = np.dtype([("person", "i4"), ("dress", "i4"), ("girth", "f4")])
+"""person: row of the posed; dress: row of the dyed."""
 _ROW: Final = 3 * 24
 _CROWD_MIN: Final = 64
-
-_NOBODY: Final[tuple[tuple[str, ...], bytes]] = ((), b"")
+_KEYS: Final = (LEVELS + 1) * len(ALL)
+"""Forms of a picture: outfits by level, and behind the last level those of shadows."""
+_ENDS: Final = (0, MESH_LEVELS * len(ALL), LEVELS * len(ALL), _KEYS)
 
 _POSE_VERTEX: Final = """#version 430
 void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
@@ -64,78 +71,104 @@ void main() {
 """
 
 
-class CrowdDrawing:
-    """The people of a picture. shadows: whether they are shaded by shadow maps."""
+class Watched(NamedTuple):
+    """The people of a picture. heights: of the ground at (N, 2) points; shadows: whether they throw any."""
 
-    def __init__(self, context: moderngl.Context, shadows: bool) -> None:
+    people: People
+    time_s: float
+    heights: Callable[[Floats], Floats]
+    shadows: bool
+
+
+class _Worn(NamedTuple):
+    """(N,) outfits and girths of people, (N, coats, 3) colours, (N, 4) bodies as poses take them."""
+
+    outfit: NDArray[np.intp]
+    girth: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    bodies: Floats
+
+
+class CrowdDrawing:
+    """The people of the pictures of a batch."""
+
+    def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self._clips = own_clips()
         matrices = self._clips.matrices
         self._baked = _texture(context, (_ROW, len(matrices)), 4, "f4", matrices.tobytes())
         self._pose = context.program(vertex_shader=_POSE_VERTEX, fragment_shader=_POSE_FRAGMENT)
         self._everywhere = context.vertex_array(self._pose, [])
-        self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level), shadows)
-        self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level), shadows)
+        self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
+        self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level))
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
         self._starts = np.zeros((LEVELS * len(ALL), 3), dtype=np.uint32)
         self._known = np.zeros(len(self._starts), dtype=bool)
-        self._split = (0, 0, 0)
+        self._split: list[list[int]] = []
         self._room = 0
-        self._dyed_for = _NOBODY
+        self._dyed_for: list[tuple[tuple[str, ...], bytes]] = []
         self._grow(_CROWD_MIN)
 
-    def set(
-        self,
-        people: People,
-        time_s: float,
-        z_m: Floats,
-        shot: Shot,
-        anchor: Floats,
-        seen: NDArray[np.bool_],
-        casts: NDArray[np.bool_],
-    ) -> None:
-        """Hold these people, standing at heights (N,) z_m, as this picture will show them; binds a framebuffer.
-
-        seen: (N,) who can be in the picture; casts: (N,) whose shadow can.
-        """
-        count = len(people)
-        self._split = (0, 0, 0)
-        if not count:
+    def set(self, watched: Sequence[Watched], shots: Shots) -> None:
+        """Hold these people as the pictures will show them, each on the ground; binds a framebuffer."""
+        counts = [len(one.people) for one in watched]
+        self._split = [[0, 0, 0, 0]] * len(watched)
+        if not sum(counts):
             return
-        if count > self._room:
-            self._grow(2 * count)
-        posed = poses(people, time_s, self._clips)
-        told = np.zeros((count, 4, 4), dtype=np.float32)
+        whose = np.repeat(np.arange(len(watched)), counts)
+        xy = np.concatenate([one.people.xy for one in watched])
+        casting = np.array([CAST_M if one.shadows else 0.0 for one in watched])
+        seen, casts = shots.sees(whose, xy, PERSON_MARGIN_M), shots.far_m(whose, xy) < casting[whose]
+        rows = (seen | casts).nonzero()[0]
+        if not len(rows):
+            return
+        whose, xy, seen, casts = whose[rows], xy[rows], seen[rows], casts[rows]
+        z_m = _heights(watched, whose, xy)
+        who = [(one.people.ids, one.people.age.tobytes()) for one in watched]
+        worn = [_worn(*one) for one in who]
+        outfit, girth, bodies = (
+            np.concatenate([getattr(one, name) for one in worn])[rows] for name in ("outfit", "girth", "bodies")
+        )
+        heading, strides, pace = (
+            np.concatenate([getattr(one.people, name) for one in watched])[rows]
+            for name in ("heading", "strides", "pace")
+        )
+        loops = np.concatenate([loops_of(one.people.doing) for one in watched])[rows]
+        time_s = np.array([one.time_s for one in watched])[whose]
+        posed = poses_of(bodies, pace, strides, loops, time_s, self._clips)
+        told = np.zeros((len(rows), 4, 4), dtype=np.float32)
         told[:, 0], told[:, 1] = posed.rows, posed.weights
-        told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = people.xy - anchor, z_m, posed.scale
-        told[:, 3, 0], told[:, 3, 1] = np.cos(people.heading), np.sin(people.heading)
-        who = people.ids, people.age.tobytes()
-        outfit, girth, colours = _dressed(*who)
-        self._told.write(told, viewport=(0, 0, 4, count))
+        told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = xy - shots.anchor[whose], z_m, posed.scale
+        told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
+        if sum(counts) > self._room:
+            self._grow(2 * sum(counts))
+        self._told.write(told, viewport=(0, 0, 4, len(rows)))
         if who != self._dyed_for:
-            self._dyed.write(colours, viewport=(0, 0, len(COATS), count))
+            colours = np.concatenate([one.colours for one in worn])
+            self._dyed.write(colours, viewport=(0, 0, len(COATS), len(colours)))
             self._dyed_for = who
-        self._set_draws(outfit, levels(people.xy, z_m, shot), seen, casts, girth)
+        self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
         self._posed.use()
-        self._posed.viewport = (0, 0, _ROW, count)
+        self._posed.viewport = (0, 0, _ROW, len(rows))
         self._context.enable_only(moderngl.NOTHING)
         self._baked.use(0)
         self._told.use(1)
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
 
-    def draw(self, stage: Pass) -> None:
-        """Draw what was set; in the shadow maps of what moves everybody has few triangles."""
-        near, far, shadow = self._split
-        if stage == "still" or near + far + shadow == 0:
+    def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
+        """Draw those of a picture; in the shadow maps of what moves everybody has few triangles. shadows: whether they
+        are shaded by shadow maps."""
+        near, far, cast, end = self._split[picture]
+        if stage == "still" or near == end:
             return
         self._matrices.use(0)
         self._dyed.use(1)
         held = self._instances, self._commands
         if stage == "moving":
-            self._far.draw(stage, *held, shadow, near + far)
+            self._far.draw(stage, shadows, *held, end - cast, cast)
         else:
-            self._near.draw(stage, *held, near, 0)
-            self._far.draw(stage, *held, far, near)
+            self._near.draw(stage, shadows, *held, far - near, near)
+            self._far.draw(stage, shadows, *held, cast - far, far)
 
     def release(self) -> None:
         self._near.release()
@@ -146,35 +179,27 @@ class CrowdDrawing:
 
     def _set_draws(
         self,
+        whose: NDArray[np.intp],
         outfit: NDArray[np.intp],
         level: NDArray[np.intp],
         seen: NDArray[np.bool_],
         casts: NDArray[np.bool_],
         girth: NDArray[np.float32],
+        dress: NDArray[np.intp],
     ) -> None:
-        """Fill the buffers of instances and of draws: near levels first, then far ones, then shadows, which have a
-        level of their own behind the last."""
-        cast = np.full(len(outfit), LEVELS)
+        """Fill the buffers of instances and of draws: picture after picture, near levels first, then far ones, then
+        shadows, which have a level of their own behind the last."""
         in_view, casting = seen.nonzero()[0], casts.nonzero()[0]
         people = np.concatenate([in_view, casting])
-        if not len(people):
-            return
-        key = np.concatenate([level[in_view], cast[casting]]) * len(ALL) + outfit[people]
-        order = key.argsort(kind="stable")
-        people, key = people[order], key[order]
-        begins = np.empty(len(key), dtype=bool)
-        begins[0], begins[1:] = True, key[1:] != key[:-1]
-        first = begins.nonzero()[0]
-        form = key[first]
-        start = self._start(form)
-        commands = np.empty((len(first), 5), dtype=np.uint32)
-        commands[:, 0], commands[:, 2:4], commands[:, 4] = start[:, 0], start[:, 1:], first
-        commands[:-1, 1] = first[1:] - first[:-1]
-        commands[-1, 1] = len(key) - first[-1]
-        near, far = form.searchsorted((MESH_LEVELS * len(ALL), LEVELS * len(ALL))).tolist()
-        self._split = near, far - near, len(form) - far
+        levels_ = np.concatenate([level[in_view], np.full(len(casting), LEVELS)])
+        order, form, commands = runs_of((whose[people] * (LEVELS + 1) + levels_) * len(ALL) + outfit[people])
+        people = people[order]
+        start = self._start(form % _KEYS)
+        commands[:, 0], commands[:, 2:4] = start[:, 0], start[:, 1:]
+        ends = np.arange(len(self._split))[:, None] * _KEYS + np.array(_ENDS)
+        self._split = form.searchsorted(ends).tolist()
         table = np.empty(len(people), dtype=_INSTANCE)
-        table["person"], table["girth"] = people, girth[people]
+        table["person"], table["dress"], table["girth"] = people, dress[people], girth[people]
         self._instances.write(table)
         self._commands.write(commands)
 
@@ -191,12 +216,12 @@ class CrowdDrawing:
     def _grow(self, room: int) -> None:
         """Make room for more people."""
         self._release_room()
-        self._room, self._dyed_for = room, _NOBODY
+        self._room, self._dyed_for = room, []
         self._told = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
         self._posed = self._context.framebuffer([self._matrices])
-        self._instances = self._context.buffer(reserve=2 * room * 8)
+        self._instances = self._context.buffer(reserve=2 * room * _INSTANCE.itemsize)
         self._commands = self._context.buffer(reserve=2 * room * 20)
         self._held = [self._posed, self._told, self._dyed, self._matrices, self._instances, self._commands]
 
@@ -208,20 +233,33 @@ class CrowdDrawing:
         self._held = []
 
 
-@lru_cache(maxsize=64)
-def _dressed(ids: tuple[str, ...], ages: bytes) -> tuple[NDArray[np.intp], NDArray[np.float32], bytes]:
-    """(N,) outfits and girths of people, and their colours as they go up."""
+def _heights(watched: Sequence[Watched], whose: NDArray[np.intp], xy: Floats) -> Floats:
+    """(N,) height of the ground at (N, 2) points of these pictures, in their order; each ground is asked once."""
+    grounds = list(dict.fromkeys(one.heights for one in watched))
+    if len(grounds) == 1:
+        return grounds[0](xy)
+    ground = np.array([grounds.index(one.heights) for one in watched])[whose]
+    z_m = np.empty(len(xy))
+    for i, heights in enumerate(grounds):
+        here = ground == i
+        z_m[here] = heights(xy[here])
+    return z_m
+
+
+@lru_cache(maxsize=256)
+def _worn(ids: tuple[str, ...], ages: bytes) -> _Worn:
     looks = list(map(look_of, ids, ages))
-    girth = np.array([who.girth_m for who in looks], dtype=np.float32)
-    return np.array([who.outfit for who in looks]), girth, np.stack([who.colours for who in looks]).tobytes()
+    return _Worn(
+        np.array([who.outfit for who in looks], dtype=np.intp),
+        np.array([who.girth_m for who in looks], dtype=np.float32),
+        np.array([who.colours for who in looks], dtype=np.uint8).reshape(-1, len(COATS), 3),
+        bodies_of(ids, ages),
+    )
 
 
-def levels(xy: Floats, z_m: Floats, shot: Shot) -> NDArray[np.intp]:
-    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are in the picture."""
-    eye = shot.eye_m
-    far_m = np.sqrt((xy[:, 0] - eye[0]) ** 2 + (xy[:, 1] - eye[1]) ** 2 + (z_m + 0.9 - eye[2]) ** 2)
-    tall_px = 1.75 / np.maximum(far_m, 0.1) * 0.5 * shot.size[1] / np.tan(0.5 * np.radians(shot.fov_deg))
-    return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -tall_px))
+def levels(shots: Shots, whose: NDArray[np.intp], xy: Floats, z_m: Floats) -> NDArray[np.intp]:
+    """(N,) level of detail of people at (N, 2) xy, standing at (N,) heights, by how tall they are in their pictures."""
+    return np.asarray(np.searchsorted(-np.array(LEVEL_PX), -shots.tall_px(whose, xy, z_m)))
 
 
 def _texture(

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from physics.cameras.gl.corners import LAYOUT, CornerRows, corners, joined_corners
-from physics.cameras.gl.shading import Pass, programs
+from physics.cameras.gl.shading import Pass, Programs, programs
 from physics.cameras.gl.surfaces import KNOWN, LOOKED_UP, Surfaces
 from physics.world.mesh import Part
 
@@ -75,12 +75,9 @@ void main() {{
 class Forms:
     """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
 
-    def __init__(self, context: moderngl.Context, surfaces: Surfaces, shadows: bool) -> None:
-        self._context, self._layers = context, surfaces.surfaces
-        self.programs = programs(context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
-        for uniform in self.programs.uniforms("layers"):
-            if uniform is not None:
-                uniform.write(surfaces.known)
+    def __init__(self, context: moderngl.Context, surfaces: Surfaces) -> None:
+        self._context, self._layers, self._known = context, surfaces.surfaces, surfaces.known
+        self._programs: dict[bool, Programs] = {}
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._ids: dict[Hashable, int] = {}
@@ -90,6 +87,15 @@ class Forms:
         self.version = 0
         self._held = -1
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
+
+    def programs(self, shadows: bool) -> Programs:
+        """The programs of all forms, shaded by shadow maps or not."""
+        if shadows not in self._programs:
+            self._programs[shadows] = made = programs(self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
+            for uniform in made.uniforms("layers"):
+                if uniform is not None:
+                    uniform.write(self._known)
+        return self._programs[shadows]
 
     def id(self, key: Hashable, parts: Callable[[], Sequence[Part]]) -> int:
         """The number of a form; `parts` makes it when its key is new."""
@@ -134,42 +140,44 @@ class Forms:
 
 
 class Things:
-    """A set of instances, replaced as a whole, drawn in one call. stages: the passes in which it is drawn."""
+    """A set of instances in runs of one form each, replaced as a whole; a run of runs is drawn in one call."""
 
-    def __init__(self, context: moderngl.Context, forms: Forms, stages: Sequence[Pass]) -> None:
-        self._context, self._forms, self._stages = context, forms, stages
+    def __init__(self, context: moderngl.Context, forms: Forms) -> None:
+        self._context, self._forms = context, forms
         self._bound = -1
         self._room = 0
-        self._count = 0
         self._instances: moderngl.Buffer | None = None
         self._commands: moderngl.Buffer | None = None
-        self._arrays: list[moderngl.VertexArray] = []
+        self._arrays: dict[bool, list[moderngl.VertexArray]] = {}
+        self._ends = [0, 0]
 
-    def set(self, form: NDArray[np.int64], rows: NDArray[np.void]) -> None:
-        """(N,) numbers of forms and (N,) rows of INSTANCE."""
-        self._count = 0
+    def set(
+        self, form: NDArray[np.intp], rows: CornerRows, part: NDArray[np.intp] | None = None, parts: int = 1
+    ) -> None:
+        """(N,) numbers of forms and (N,) rows of INSTANCE. part: (N,) which of `parts` each belongs to."""
         if not len(form):
+            self._ends = [0] * (parts + 1)
             return
-        order = self._forms.rank[form].argsort(kind="stable")
-        form = form[order]
-        first = np.concatenate([[0], (form[1:] != form[:-1]).nonzero()[0] + 1])
-        self._count = len(first)
-        commands = np.empty((len(first), 5), dtype=np.uint32)
-        draws = self._forms.draws[form[first]]
-        commands[:, 0], commands[:, 2:4], commands[:, 4] = draws[:, 0], draws[:, 1:], first
-        commands[:-1, 1], commands[-1, 1] = first[1:] - first[:-1], len(form) - first[-1]
+        rank, kinds = self._forms.rank, len(self._forms.rank)
+        order, key, commands = runs_of(rank[form] if part is None else rank[form] + kinds * part)
+        draws = self._forms.draws[form[order[commands[:, 4]]]]
+        commands[:, 0], commands[:, 2:4] = draws[:, 0], draws[:, 1:]
+        self._ends = key.searchsorted(kinds * np.arange(parts + 1)).tolist()
         if len(form) > self._room:
             self._make_room(2 * len(form))
         assert self._instances is not None and self._commands is not None
         self._instances.write(rows[order])
         self._commands.write(commands)
 
-    def draw(self, stage: Pass) -> None:
-        if self._count and stage in self._stages:
-            if self._bound != self._forms.version:
-                self._bind()
+    def draw(self, stage: Pass, shadows: bool, part: int = 0) -> None:
+        """Draw one part. shadows: whether it is shaded by shadow maps."""
+        first, count = self._ends[part], self._ends[part + 1] - self._ends[part]
+        if count:
+            if self._bound != self._forms.version or shadows not in self._arrays:
+                self._bind(shadows)
             assert self._commands is not None
-            self._arrays[stage != "colour"].render_indirect(self._commands, moderngl.TRIANGLES, count=self._count)
+            array = self._arrays[shadows][stage != "colour"]
+            array.render_indirect(self._commands, moderngl.TRIANGLES, count=count, first=first)
 
     def _make_room(self, count: int) -> None:
         self._drop()
@@ -177,41 +185,68 @@ class Things:
         self._instances = self._context.buffer(reserve=self._room * INSTANCE.itemsize, dynamic=True)
         self._commands = self._context.buffer(reserve=self._room * 20, dynamic=True)
 
-    def _bind(self) -> None:
+    def _bind(self, shadows: bool) -> None:
         at_corners, triangles = self._forms.buffers()
-        for array in self._arrays:
-            array.release()
+        if self._bound != self._forms.version:
+            self._unbind()
         content = [
             (at_corners, *LAYOUT),
             (self._instances, "3f 4f 4f1 /i", "thing_at", "thing_turn", "thing_paint"),
         ]
-        self._arrays = [
+        self._arrays[shadows] = [
             self._context.vertex_array(program, content, triangles, skip_errors=True)
-            for program in self._forms.programs
+            for program in self._forms.programs(shadows)
         ]
         self._bound = self._forms.version
 
+    def _unbind(self) -> None:
+        for array in (array for both in self._arrays.values() for array in both):
+            array.release()
+        self._arrays, self._bound = {}, -1
+
     def _drop(self) -> None:
-        for thing in (*self._arrays, self._instances, self._commands):
+        self._unbind()
+        for thing in (self._instances, self._commands):
             if thing is not None:
                 thing.release()
-        self._arrays, self._instances, self._commands, self._bound = [], None, None, -1
+        self._instances = self._commands = None
 
     def release(self) -> None:
         self._drop()
-        self._room = self._count = 0
+        self._room, self._ends = 0, [0, 0]
 
 
-def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int, about_y: ArrayLike = 0.0) -> CornerRows:
-    """Rows of INSTANCE. at: (N, 3) from the anchor; heading, about_y: radians, a turn about the thing's own y axis
-    comes first; paint: (N, 3) or (3,)."""
+def runs_of(key: NDArray[np.intp]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.uint32]]:
+    """(N,) the order that sorts (N,) keys, the same of equal ones; (F,) the keys that there are; and for each the row
+    of an indirect draw, (F, 5), with its count and its place in that order."""
+    order = key.argsort(kind="stable")
+    key = key[order]
+    begins = np.empty(len(key), dtype=bool)
+    begins[:1], begins[1:] = True, key[1:] != key[:-1]
+    first = begins.nonzero()[0]
+    commands = np.zeros((len(first), 5), dtype=np.uint32)
+    commands[:, 4] = first
+    commands[:-1, 1], commands[-1:, 1] = first[1:] - first[:-1], len(key) - first[-1:]
+    return order, key[first], commands
+
+
+def instances(at: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int) -> CornerRows:
+    """Rows of INSTANCE. at: (N, 3) from the anchor; heading: radians; paint: (N, 3) or (3,)."""
+    return turned_instances(at, 0.0, 0.0, heading, paint, label)
+
+
+def turned_instances(
+    at: ArrayLike, roll: ArrayLike, pitch: ArrayLike, heading: ArrayLike, paint: ArrayLike, label: int
+) -> CornerRows:
+    """Rows of INSTANCE, turned about x, then y, then z. at: (N, 3) from the anchor; paint: (N, 3) or (3,)."""
     at = np.asarray(at, dtype=float).reshape(-1, 3)
-    half_z, half_y = 0.5 * np.asarray(heading, dtype=float), 0.5 * np.asarray(about_y, dtype=float)
-    cz, sz, cy, sy = np.cos(half_z), np.sin(half_z), np.cos(half_y), np.sin(half_y)
+    half = [0.5 * np.asarray(angle, dtype=float) for angle in (roll, pitch, heading)]
+    (cx, cy, cz), (sx, sy, sz) = map(np.cos, half), map(np.sin, half)
     rows = np.zeros(len(at), dtype=INSTANCE)
     rows["at"] = at
     turn = rows["turn"]
-    turn[:, 0], turn[:, 1], turn[:, 2], turn[:, 3] = -sz * sy, cz * sy, sz * cy, cz * cy
+    turn[:, 0], turn[:, 1] = sx * cy * cz - cx * sy * sz, cx * sy * cz + sx * cy * sz
+    turn[:, 2], turn[:, 3] = cx * cy * sz - sx * sy * cz, cx * cy * cz + sx * sy * sz
     rows["paint"][:, :3] = np.rint(255.0 * np.asarray(paint, dtype=float))
     rows["paint"][:, 3] = label
     return rows

@@ -1,4 +1,9 @@
-"""The street around a view for the gl camera: the same things as in physics.cameras.scene, as buffers and instances."""
+"""The street that stands around a view for the gl camera: the same things as in physics.cameras.scene, as buffers.
+
+What can be in a picture is sorted out for a whole cell of eyes and sector of headings at a time, with a margin, so
+that a robot that drives on mostly finds everything as it lies. Cell and sector hang on the view alone, and so does
+what is drawn.
+"""
 
 from __future__ import annotations
 
@@ -12,179 +17,178 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
-from cosim.core.state import LABELS, RobotState, Street, Vehicles
-from cosim.spec.robot import Robot
+from cosim.core.state import LABELS, Street
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
-from physics.cameras.gl.crowd import CrowdDrawing
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.robot_body import robot_parts
 from physics.cameras.gl.shading import Pass
-from physics.cameras.gl.shadows import SHADOW_REACH_M, STEP_M, middle_of
-from physics.cameras.gl.surfaces import TileBuffers, surfaces
-from physics.cameras.gl.tiles import ground_buffers, tile_shaders
-from physics.cameras.gl.walls import wall_buffers, wall_shaders
-from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, Shot, View
-from physics.robots import urdf_of
-from physics.street import props, vehicles
+from physics.cameras.gl.shadows import STEP_M
+from physics.cameras.gl.surfaces import TileRows, surfaces
+from physics.cameras.gl.tiles import ground_layer, ground_rows, tile_shaders
+from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
+from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
+from physics.street import props
 from physics.street.furniture import KINDS, Prop, parts_of
-from physics.textures.layers import Colour
-from physics.world.bullet import p
 from physics.world.mesh import Part
 from physics.world.surface import Surface
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
 
-CAST_M: Final = 18.0
-"""How far from the eye people throw shadows."""
+_CELL_M: Final = 2.0
+_SECTOR_RAD: Final = math.radians(7.5)
+_SLACK_M: Final = _CELL_M * math.sqrt(0.5)
+"""How far an eye may be from the middle of its cell."""
 _TILE_REACH_M: Final = 34.0
 """A tile's farthest point from its middle, and what stands over its border."""
 
-_Placed = tuple[NDArray[np.int64], CornerRows]
+_Placed = tuple[NDArray[np.intp], CornerRows]
 """Numbers of forms and rows of instances."""
-_CLOCK: Final = Clock()
-_NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.int64), np.zeros(0, dtype=INSTANCE))
+_NOTHING: Final[_Placed] = (np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTANCE))
 
 
 @dataclass(frozen=True, slots=True)
 class _Tile:
-    """A tile on the graphics card, its (2,) middle in world metres, and the things that stand in it, at (N, 2)
-    thing_xy, drawn as far as (N,) seen_m; their rows are relative to the middle."""
+    """What a tile shows, (2,) middle in world metres, and the things that stand in it, at (N, 2) thing_xy, drawn as
+    far as (N,) seen_m; their rows are relative to the middle."""
 
     middle: Floats
-    ground: TileBuffers
-    paint: TileBuffers
-    walls: TileBuffers
+    ground: TileRows | None
+    paint: TileRows | None
+    walls: TileRows | None
     things: _Placed
     thing_xy: Floats
     seen_m: Floats
     posts: list[props.SignalPost]
     post_z: Floats
 
-    def release(self) -> None:
-        for buffers in (self.ground, self.paint, self.walls):
-            buffers.release()
-
 
 class GlScene:
-    """Keeps what the street around a view needs; what is drawn depends on view and street alone."""
+    """Keeps what stands around a view; what is drawn depends on view and signals alone."""
 
     def __init__(
-        self, context: moderngl.Context, surface: Surface, barriers: Sequence[Barrier], model: Robot, light: Lighting
+        self, context: moderngl.Context, forms: Forms, surface: Surface, barriers: Sequence[Barrier], light: Lighting
     ) -> None:
-        self._context, self._surface, self._model = context, surface, model
-        self._tiles: dict[Key, _Tile] = {}
-        self._shadows = shadows = light.shadows
+        self._surface, self._forms, self._shadows = surface, forms, light.shadows
         self._surfaces = surfaces(context)
-        self._shaders = tile_shaders(context, self._surfaces, shadows)
-        self._wall_shaders = wall_shaders(context, self._surfaces, shadows, light.lamps > 0.0)
-        self._forms = Forms(context, self._surfaces, shadows)
-        self._seen = Things(context, self._forms, ("colour",))
-        self._standing = Things(context, self._forms, ("still",))
-        self._movers = Things(context, self._forms, ("moving",))
-        self._still_for: tuple[float, ...] | None = None
-        self._shading: list[_Tile] = []
+        ground = tile_shaders(context, self._surfaces, light.shadows)
+        walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
+        self._ground, self._paint = ground_layer(context, ground), ground_layer(context, ground)
+        self._walls = wall_layer(context, walls)
+        self._seen, self._standing = Things(context, forms), Things(context, forms)
+        self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
+        self._cell: tuple[int, int] | None = None
+        self._placed = False
         self._anchor: Floats = np.zeros(2)
-        self._stands_for: tuple[frozenset[Key], Floats] | None = None
-        self._stands: _Placed = _NOTHING
-        self._stands_xy: Floats = np.zeros((0, 2))
-        self._stands_seen_m: Floats = np.zeros(0)
-        self._posts: list[tuple[props.SignalPost, float]] = []
+        self._seen_for: tuple[tuple[int, int], int, int | None] | None = None
+        self._still_for: tuple[float, ...] | None = None
         self._lit_for: list[bool | None] = []
         self._lit: _Placed = _NOTHING
-        self._around: list[_Tile] = []
-        self._middles: Floats = np.zeros((0, 2))
-        self._in_view: list[_Tile] = []
         self._fences = [self._fence(barrier) for barrier in barriers]
         self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
-        self._fleet: dict[tuple[str, float, float], tuple[int, Colour]] = {}
-        self._crowd = CrowdDrawing(context, shadows)
 
-    def arrange(self, shot: Shot, anchor: Floats, street: Street, robot: RobotState | None, body: bool) -> None:
-        """Hold everything that a picture can show. body: the robot itself is in the picture, not its shadow alone."""
-        view = shot.view
-        if (anchor != self._anchor).any():
-            self._anchor = anchor
-        self._stream(view)
-        self._show_people(shot, street)
-        middle = middle_of(view.eye_m)
-        seen, cast = self._vehicles(view, middle, street.vehicles)
-        placed = [self._things(view), *self._fences_now(), self._lamps(street), seen]
-        myself = self._robot(robot) if robot is not None and (body or self._shadows) else _NOTHING
-        _set(self._seen, [*placed, myself] if body else placed)
+    def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
+        """Hold everything standing that a picture can show. middle: (3,) of the space with shadows."""
+        cell = round(view.eye_m[0] / _CELL_M), round(view.eye_m[1] / _CELL_M)
+        if cell != self._cell:
+            self._stream(cell)
+            self._cell = cell
+        if not self._placed or (anchor != self._anchor).any():
+            self._place(anchor)
+        self._light(street)
+        seen_for = cell, *_sector(view)
+        if seen_for != self._seen_for:
+            self._choose(*seen_for)
+            self._seen_for = seen_for
         if self._shadows:
-            _set(self._movers, [cast, myself])
-            self._stand(middle)
-
-    def _show_people(self, shot: Shot, street: Street) -> None:
-        """Those who can be in the picture, and those whose shadows can."""
-        xy = street.people.xy
-        seen = shot.view.sees(xy, PERSON_MARGIN_M)
-        casts = _near(xy, shot.eye_m, CAST_M)
-        rows = (seen | casts if self._shadows else seen).nonzero()[0]
-        who = street.people.only(rows)
-        z = self._surface.heights(who.xy)
-        self._crowd.set(who, _CLOCK.time_s(street.tick), z, shot, self._anchor, seen[rows], casts[rows])
-
-    def _stand(self, middle: Floats) -> None:
-        """What stands and throws shadows in the square around its middle, seen or not."""
-        still = (*middle.tolist(), *self._anchor.tolist())
-        if still != self._still_for:
-            keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
-            self._shading = [self._tiles[key] for key in keys]
-            rows = [self._shifted(tile, np.arange(len(tile.thing_xy))) for tile in self._shading]
-            _set(self._standing, [*rows, *self._fences_now()])
-            self._still_for = still
+            self._stand(middle, anchor)
 
     def draw(self, stage: Pass) -> None:
-        """Draw what was arranged: the small and near first, then the ground from near to far."""
-        self._crowd.draw(stage)
+        """Draw what was arranged: the small first, then walls and ground from near to far."""
+        if stage == "moving":
+            return
         if stage == "colour":
             self._surfaces.bind()
-        for things in (self._seen, self._standing, self._movers):
-            things.draw(stage)
-        if stage != "moving":
-            for tile in self._in_view if stage == "colour" else self._shading:
-                tile.walls.draw(stage, self._anchor)
-                tile.ground.draw(stage, self._anchor)
+        (self._seen if stage == "colour" else self._standing).draw(stage, self._shadows)
+        self._walls.draw(stage)
+        self._ground.draw(stage)
 
     def draw_paint(self) -> None:
         """Draw what lies on the ground; to be drawn after it, without labels and depth."""
-        for tile in self._in_view:
-            tile.paint.draw("colour", self._anchor)
+        self._paint.draw("colour")
 
     def release(self) -> None:
-        for tile in self._tiles.values():
-            tile.release()
+        for held in (self._ground, self._paint, self._walls, self._seen, self._standing):
+            held.release()
         self._tiles.clear()
-        for things in (self._seen, self._standing, self._movers):
-            things.release()
-        self._crowd.release()
-        self._forms.release()
 
-    def _stream(self, view: View) -> None:
-        x, y = float(view.eye_m[0]), float(view.eye_m[1])
-        keys = [key for _, key in sorted(distances_within(x, y, VISIBLE_M))]
-        if keys != self._keys:
-            for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
-                self._tiles.pop(key).release()
-            for key in keys:
-                if key not in self._tiles:
-                    self._tiles[key] = self._built(key)
-            self._keys, self._around = keys, [self._tiles[key] for key in keys]
-            self._middles = np.array([tile.middle for tile in self._around])
-        self._in_view = [self._around[i] for i in view.sees(self._middles, _TILE_REACH_M, math.inf).nonzero()[0]]
+    def _stream(self, cell: tuple[int, int]) -> None:
+        """Hold the tiles around a cell, the nearest first."""
+        x, y = cell[0] * _CELL_M, cell[1] * _CELL_M
+        keys = [key for _, key in sorted(distances_within(x, y, VISIBLE_M + _SLACK_M))]
+        if keys == self._keys:
+            return
+        for key in [k for k in self._tiles if distance_to(k, x, y) > FORGET_M]:
+            del self._tiles[key]
+        for key in keys:
+            if key not in self._tiles:
+                self._tiles[key] = self._built(key)
+        tiles = [self._tiles[key] for key in keys]
+        self._keys, self._middles = keys, np.array([tile.middle for tile in tiles])
+        for layer, rows in (
+            (self._ground, [tile.ground for tile in tiles]),
+            (self._paint, [tile.paint for tile in tiles]),
+            (self._walls, [tile.walls for tile in tiles]),
+        ):
+            layer.hold(rows, self._middles)
+        self._stands_xy = np.concatenate([tile.thing_xy for tile in tiles])
+        self._stands_seen_m = np.minimum(np.concatenate([tile.seen_m for tile in tiles]), VISIBLE_M)
+        self._posts = [one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)]
+        self._placed = False
+
+    def _place(self, anchor: Floats) -> None:
+        """Measure everything from an anchor."""
+        self._anchor, self._placed = anchor, True
+        self._seen_for, self._still_for, self._lit_for = None, None, []
+        for layer in (self._ground, self._paint, self._walls):
+            layer.place(anchor)
+        placed = [self._shifted(self._tiles[key]) for key in self._keys]
+        self._stands = _joined(placed)
+        self._fenced = _joined([_NOTHING, *self._fences_now(anchor)])
+
+    def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
+        """Take what can be in the picture of any eye in the cell that looks into the sector."""
+        offset = self._stands_xy - np.multiply(cell, _CELL_M)
+        chosen = np.hypot(offset[:, 0], offset[:, 1]) < self._stands_seen_m + _SLACK_M
+        tiles = np.ones(len(self._keys), dtype=bool)
+        if half is not None:
+            chosen &= _within(offset, sector, half, PROP_MARGIN_M)
+            tiles = _within(self._middles - np.multiply(cell, _CELL_M), sector, half, _TILE_REACH_M)
+        rows = chosen.nonzero()[0]
+        form, things = self._stands
+        self._seen.set(*_joined([(form[rows], things[rows]), self._fenced, self._lit]))
+        for layer in (self._ground, self._paint, self._walls):
+            layer.show("colour", tiles.nonzero()[0])
+
+    def _stand(self, middle: Floats, anchor: Floats) -> None:
+        """What stands and throws shadows in the square around its middle, seen or not."""
+        still = (*middle.tolist(), *anchor.tolist())
+        if still != self._still_for:
+            keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
+            self._standing.set(*_joined([*(self._shifted(self._tiles[key]) for key in keys), self._fenced]))
+            tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
+            for layer in (self._ground, self._walls):
+                layer.show("still", tiles)
+            self._still_for = still
 
     def _built(self, key: Key) -> _Tile:
         x0, y0, x1, y1 = square(key)
         middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
         chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
-        ground = ground_buffers(self._context, self._shaders, (*finish.laid, *chunk.ground), middle)
-        painted = ground_buffers(self._context, self._shaders, finish.painted, middle)
-        walls = wall_buffers(self._context, self._wall_shaders, chunk.buildings, finish.styles, middle)
+        ground = ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle)
+        painted = ground_rows(self._surfaces, finish.painted, middle)
+        walls = wall_rows(self._surfaces, chunk.buildings, finish.styles, middle)
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._surface.heights(post_xy)
         furniture = chunk.props
@@ -195,7 +199,7 @@ class GlScene:
         pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         headings = [post.heading_rad for post in posts]
         poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
-        things = np.array([*form, *[pole] * len(posts)], dtype=np.int64), np.concatenate([rows, poles])
+        things = np.array([*form, *[pole] * len(posts)], dtype=np.intp), np.concatenate([rows, poles])
         seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
         thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
         return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
@@ -206,27 +210,11 @@ class GlScene:
             lambda: parts_of(*prop.form),
         )
 
-    def _things(self, view: View) -> _Placed:
-        """What stands in the tiles around, as far as it is drawn."""
-        keys = frozenset(self._keys)
-        if self._stands_for is None or self._stands_for[0] != keys or self._stands_for[1] is not self._anchor:
-            tiles = [self._tiles[key] for key in sorted(keys)]
-            placed = [self._shifted(tile, np.arange(len(tile.thing_xy))) for tile in tiles]
-            self._stands = np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed])
-            self._stands_xy = np.concatenate([tile.thing_xy for tile in tiles])
-            self._stands_seen_m = np.concatenate([tile.seen_m for tile in tiles])
-            self._posts = [one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)]
-            self._stands_for, self._lit_for = (keys, self._anchor), []
-        rows = view.rows(self._stands_xy, PROP_MARGIN_M)
-        rows = rows[_near(self._stands_xy[rows], view.eye_m, self._stands_seen_m[rows])]
-        form, things = self._stands
-        return form[rows], things[rows]
-
-    def _shifted(self, tile: _Tile, rows: NDArray[np.intp]) -> _Placed:
+    def _shifted(self, tile: _Tile) -> _Placed:
         form, things = tile.things
-        here = things[rows]
+        here = things.copy()
         here["at"][:, :2] += tile.middle - self._anchor
-        return form[rows], here
+        return form, here
 
     def _fence(self, barrier: Barrier) -> _Placed:
         z = self._surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
@@ -236,21 +224,20 @@ class GlScene:
         rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
         return np.array([form]), rows
 
-    def _fences_now(self) -> list[_Placed]:
+    def _fences_now(self, anchor: Floats) -> list[_Placed]:
         placed = []
         for (form, rows), xy in zip(self._fences, self._fence_xy, strict=True):
             here = rows.copy()
-            here["at"][:, :2] = xy - self._anchor
+            here["at"][:, :2] = xy - anchor
             placed.append((form, here))
         return placed
 
-    def _lamps(self, street: Street) -> _Placed:
-        """The lit lamp of every signal whose state is known; after `_things`."""
+    def _light(self, street: Street) -> None:
+        """Let the lamp of every signal whose state is known be lit."""
         signals = street.signals
         shown = [signals[post.crossing].walk if post.crossing in signals else None for post, _ in self._posts]
         if shown != self._lit_for:
-            self._lit_for, self._lit = shown, self._lamps_showing(shown)
-        return self._lit
+            self._lit_for, self._lit, self._seen_for = shown, self._lamps_showing(shown), None
 
     def _lamps_showing(self, shown: list[bool | None]) -> _Placed:
         lit = {walk: self._forms.id(("signal", walk), partial(_lamp, walk)) for walk in props.LAMPS}
@@ -265,52 +252,27 @@ class GlScene:
             return _NOTHING
         return np.array(forms), instances(at, heading, paint, LABELS["signal"])
 
-    def _vehicles(self, view: View, middle: Floats, which: Vehicles) -> tuple[_Placed, _Placed]:
-        """Vehicles in the picture, and those that throw shadows in the square around its middle."""
-        seen = view.sees(which.xy, VEHICLE_MARGIN_M)
-        casts = _near(which.xy, middle, SHADOW_REACH_M)
-        rows = (seen | casts if self._shadows else seen).nonzero()[0]
-        if not len(rows):
-            return _NOTHING, _NOTHING
-        forms, paints = zip(*(self._vehicle_form(which.ids[i], *which.size[i].tolist()) for i in rows), strict=True)
-        xy, heading, form = which.xy[rows], which.heading[rows], np.array(forms)
-        lean = self._surface.road(xy, heading, which.size[rows])
-        placed = instances(np.column_stack([xy - self._anchor, lean[:, 0]]), heading, paints, LABELS["vehicle"])
-        if lean.any():
-            placed["turn"] = [
-                p.getQuaternionFromEuler((*turn, h)) for turn, h in zip(lean[:, 1:], heading, strict=True)
-            ]
-        seen, casts = seen[rows], casts[rows]
-        return (form[seen], placed[seen]), (form[casts], placed[casts])
 
-    def _vehicle_form(self, name: str, length_m: float, width_m: float) -> tuple[int, Colour]:
-        """The form of a vehicle, and its paint."""
-        key = name, length_m, width_m
-        if key not in self._fleet:
-            size = tuple(np.array([length_m, width_m]).round(1).tolist())
-            shape = vehicles.shape(name, size[0])
-            form = self._forms.id(("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size))
-            self._fleet[key] = form, vehicles.paint(name)
-        return self._fleet[key]
+def _sector(view: View) -> tuple[int, int | None]:
+    """The sector of a heading, and half the width of what its views show, in sectors; None for all around."""
+    half = math.ceil(view.half_angle_rad / _SECTOR_RAD + 0.5)
+    if view.behind_m > 0.0 or half * _SECTOR_RAD >= 0.5 * math.pi:
+        return 0, None
+    return round(view.heading_rad / _SECTOR_RAD), half
 
-    def _robot(self, robot: RobotState) -> _Placed:
-        """The robot with its base frame at its pose, leaning with the ground."""
-        form = self._forms.id(("robot", self._model.name), partial(robot_parts, urdf_of(self._model)))
-        _, roll, pitch = self._surface.lean(robot.pose, self._model.drive.span_m)
-        rows = instances((robot.pose.x_m, robot.pose.y_m, robot.z_m), 0.0, (1.0, 1.0, 1.0), LABELS["robot"])
-        rows["at"][:, :2] = np.array([robot.pose.x_m, robot.pose.y_m]) - self._anchor
-        rows["turn"] = p.getQuaternionFromEuler((roll, pitch, robot.pose.heading_rad))
-        return np.array([form]), rows
+
+def _within(offset: Floats, sector: int, half: int, margin_m: float) -> NDArray[np.bool_]:
+    """Which of (N, 2) points, measured from the middle of a cell, any of its eyes can see that looks into the sector,
+    things of radius `margin_m` standing on them."""
+    heading, aside = sector * _SECTOR_RAD, half * _SECTOR_RAD
+    cos, sin = math.cos(heading), math.sin(heading)
+    ahead, across = offset @ np.array([cos, sin]), np.abs(offset @ np.array([-sin, cos]))
+    return np.asarray(across * math.cos(aside) - ahead * math.sin(aside) < margin_m + _SLACK_M)
 
 
 def _lamp(walk: bool) -> list[Part]:
     return [Part(props.lamp_mesh(walk), glows=True)]
 
 
-def _set(things: Things, placed: Sequence[_Placed]) -> None:
-    things.set(np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed]))
-
-
-def _near(xy: Floats, middle: Floats, reach_m: float | Floats) -> NDArray[np.bool_]:
-    """Which of (N, 2) points are less than so far from the first two of `middle`."""
-    return np.asarray(np.hypot(xy[:, 0] - middle[0], xy[:, 1] - middle[1]) < reach_m)
+def _joined(placed: Sequence[_Placed]) -> _Placed:
+    return np.concatenate([form for form, _ in placed]), np.concatenate([rows for _, rows in placed])

@@ -14,7 +14,7 @@ Positions are relative to the anchor, a point of the ground near the eye on a la
 them to a hundredth of a millimetre anywhere in a city. `anchor_of(eye)` is it, in world metres: subtract
 it in float64 before an upload.
 
-The uniform block `Scene` (binding SCENE_BINDING, written once per pass by `SceneBlock`):
+The uniform block `Scene` (binding SCENE_BINDING, one for each pass of each picture, of `SceneBlocks`):
 
     mat4 clip_from_at      the camera's, or the sun's in the shadow pass; `project` is all that needs it
     mat4 shadow_from_at    to the shadow map's texture space
@@ -59,6 +59,8 @@ SKY_UNIT: Final = 5
 STILL_UNIT: Final = 6
 MOVING_UNIT: Final = 7
 ANCHOR_M: Final = 64.0
+_BLOCK_ROWS: Final = 32
+"""vec4 of a block, of which 20 are used: blocks begin where every graphics card lets them."""
 
 
 class Programs(NamedTuple):
@@ -184,30 +186,66 @@ def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
     return matrix
 
 
-class SceneBlock:
-    """The uniform block of a pass."""
+class SceneBlocks:
+    """The uniform blocks of some passes, uploaded together."""
 
     def __init__(self, context: moderngl.Context) -> None:
-        self._rows = np.zeros((4 + 4 + 12, 4), dtype=np.float32)
-        self._light: Lighting | None = None
-        self._buffer = context.buffer(reserve=self._rows.nbytes)
+        self._context = context
+        self._rows = np.zeros((0, _BLOCK_ROWS, 4), dtype=np.float32)
+        self._lights: list[Lighting | None] = []
+        self._suns: list[Floats | None] = []
+        self._buffer: moderngl.Buffer | None = None
+        self.room(1)
 
-    def write(self, clip_from_at: Floats, shadow_from_at: Floats, shot: Shot, anchor: Floats, light: Lighting) -> None:
-        """Set it for what is drawn next; matrices (4, 4)."""
-        rows = self._rows
-        if self._light is not light:
-            self._light, rows[9:16] = light, light.rows()
+    def room(self, count: int) -> None:
+        """Let there be so many at least; what was put is void if there were fewer."""
+        if count > len(self._rows):
+            self.release()
+            self._rows = np.zeros((2 * count, _BLOCK_ROWS, 4), dtype=np.float32)
+            self._lights, self._suns = [None for _ in self._rows], [None for _ in self._rows]
+            self._buffer = self._context.buffer(reserve=self._rows.nbytes)
+
+    def put(
+        self,
+        place: int,
+        clip_from_at: Floats,
+        shadow_from_at: Floats,
+        taken: Shot,
+        anchor: Floats,
+        light: Lighting,
+    ) -> None:
+        """Set one; matrices (4, 4)."""
+        rows = self._rows[place]
+        self._suns[place] = None
+        self._light(place, light)
         rows[:4], rows[4:8] = clip_from_at.T, shadow_from_at.T
-        rows[8, :2], rows[8, 2] = shot.eye_m[:2] - anchor, shot.eye_m[2]
+        rows[8, :2], rows[8, 2] = taken.eye_m[:2] - anchor, taken.eye_m[2]
         rows[16, :2] = anchor
-        rows[17:, :3] = shot.axes
-        rows[17, 3], rows[18, 3] = shot.half_picture
-        self._buffer.write(rows)
-        self.bind()
+        rows[17:20, :3] = taken.axes
+        rows[17, 3], rows[18, 3] = taken.half_picture
 
-    def bind(self) -> None:
-        """What is drawn next reads it as it was written last."""
-        self._buffer.bind_to_uniform_block(SCENE_BINDING)
+    def put_sun(self, place: int, clip_from_at: Floats, light: Lighting) -> None:
+        """Set one for a shadow map. The same matrix again, not changed since, changes nothing."""
+        if self._suns[place] is not clip_from_at:
+            self._suns[place] = clip_from_at
+            self._light(place, light)
+            self._rows[place, :4] = clip_from_at.T
+
+    def _light(self, place: int, light: Lighting) -> None:
+        if self._lights[place] is not light:
+            self._lights[place], self._rows[place, 9:16] = light, light.rows()
+
+    def upload(self) -> None:
+        assert self._buffer is not None
+        self._buffer.write(self._rows)
+
+    def bind(self, place: int = 0) -> None:
+        """What is drawn next reads this one as it was uploaded last."""
+        assert self._buffer is not None
+        each = self._rows[0].nbytes
+        self._buffer.bind_to_uniform_block(SCENE_BINDING, offset=place * each, size=each)
 
     def release(self) -> None:
-        self._buffer.release()
+        if self._buffer is not None:
+            self._buffer.release()
+            self._buffer = None

@@ -6,7 +6,8 @@ swim; what stands is drawn anew only when that point changes.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Final
 
 import moderngl
@@ -23,6 +24,8 @@ STEP_M: Final = 8.0
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
+TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
+"""From clip space to the space of a texture."""
 
 
 def middle_of(eye_m: Floats) -> Floats:
@@ -46,6 +49,16 @@ def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
     return matrix
 
 
+@contextmanager
+def casting(context: moderngl.Context) -> Iterator[None]:
+    """For the time in which shadow maps are drawn."""
+    context.enable_only(moderngl.DEPTH_TEST)
+    context.depth_func = "<"
+    context.polygon_offset = 1.5, 4.0
+    yield
+    context.polygon_offset = 0.0, 0.0
+
+
 class ShadowMaps:
     """Two depth pictures from the sun."""
 
@@ -57,8 +70,8 @@ class ShadowMaps:
             "moving": context.framebuffer(depth_attachment=self._moving),
         }
         self._drawn_for: tuple[float, ...] | None = None
-        self._matrix_for: tuple[float, ...] | None = None
-        self._matrix: Floats = np.eye(4)
+        self._matrices_for: tuple[float, ...] | None = None
+        self._matrices: tuple[Floats, Floats] = np.eye(4), TO_TEXTURE
 
     def _texture(self, pixels: int) -> moderngl.Texture:
         texture = self._context.depth_texture((pixels, pixels))
@@ -67,24 +80,21 @@ class ShadowMaps:
         texture.repeat_x = texture.repeat_y = False
         return texture
 
-    def matrix(self, middle: Floats, anchor: Floats, light: Lighting) -> Floats:
-        """`shadow_matrix`; the last one is kept."""
+    def matrices(self, middle: Floats, anchor: Floats, light: Lighting) -> tuple[Floats, Floats]:
+        """`shadow_matrix`, and the same to the space of a texture; the last ones are kept."""
         key = (*middle.tolist(), *anchor.tolist())
-        if key != self._matrix_for:
-            self._matrix_for, self._matrix = key, shadow_matrix(middle, anchor, light.to_sun)
-        return self._matrix
+        if key != self._matrices_for:
+            from_at = shadow_matrix(middle, anchor, light.to_sun)
+            self._matrices_for, self._matrices = key, (from_at, TO_TEXTURE @ from_at)
+        return self._matrices
 
     def draw(self, middle: Floats, anchor: Floats, light: Lighting, draw: Callable[[Pass], None]) -> None:
-        """Bring the maps up to date; the scene block must hold their matrix as its camera."""
-        self._context.enable_only(moderngl.DEPTH_TEST)
-        self._context.depth_func = "<"
-        self._context.polygon_offset = 1.5, 4.0
+        """Bring the maps up to date, within `casting`; the scene block must hold their matrix as its camera."""
         key = (*middle.tolist(), *anchor.tolist(), *light.to_sun.tolist())
         if key != self._drawn_for:
             self._draw("still", draw)
             self._drawn_for = key
         self._draw("moving", draw)
-        self._context.polygon_offset = 0.0, 0.0
 
     def _draw(self, stage: Pass, draw: Callable[[Pass], None]) -> None:
         frame = self._frames[stage]

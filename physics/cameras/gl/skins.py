@@ -7,6 +7,7 @@ a round one; in shadow maps they are turned towards the sun.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Final
 
 import moderngl
@@ -44,7 +45,7 @@ _SKIN: Final = """
 layout(binding = 0) uniform sampler2D posed;
 layout(binding = 1) uniform sampler2D dyed;
 in uvec4 in_joints; in vec4 in_weights; in uvec4 in_coat;
-in int person; in float girth;
+in int person; in int dress; in float girth;
 out vec3 at; out vec3 normal; flat out vec3 albedo;
 vec4 x = vec4(0.0), y = vec4(0.0), z = vec4(0.0);
 void pose(int bones) {
@@ -54,7 +55,7 @@ void pose(int bones) {
         y += in_weights[k] * texelFetch(posed, ivec2(column + 1, person), 0);
         z += in_weights[k] * texelFetch(posed, ivec2(column + 2, person), 0);
     }
-    albedo = texelFetch(dyed, ivec2(int(in_coat.x), person), 0).rgb;
+    albedo = texelFetch(dyed, ivec2(int(in_coat.x), dress), 0).rgb;
 }
 vec3 moved(vec3 v) { return vec3(dot(x.xyz, v), dot(y.xyz, v), dot(z.xyz, v)); }
 vec3 placed(vec3 v) { return vec3(x.w, y.w, z.w) + moved(v); }
@@ -106,20 +107,21 @@ void main() {{ show(albedo, normalize(normal), at, {LABELS["person"]}.0); }}
 
 
 class Skins:
-    """Bodies in one vertex and one index buffer; instances: of person and girth."""
+    """Bodies in one vertex and one index buffer; instances: of person, dress and girth. drawn: the programs, shaded by
+    shadow maps or not."""
 
     def __init__(
         self,
         context: moderngl.Context,
         made: Callable[[int, int], SkinnedBody | FarBody],
-        drawn: Programs,
+        drawn: Callable[[bool], Programs],
         layout: tuple[str, ...],
     ) -> None:
         self._context, self._made, self._drawn, self._layout = context, made, drawn, layout
         self._rows: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
-        self._held: list[moderngl.Buffer | moderngl.VertexArray] = []
-        self._arrays: tuple[moderngl.VertexArray, moderngl.VertexArray] | None = None
+        self._buffers: list[moderngl.Buffer] = []
+        self._arrays: dict[bool, tuple[moderngl.VertexArray, moderngl.VertexArray]] = {}
 
     def start(self, outfit: int, level: int) -> tuple[int, int, int]:
         """Take in a body: count of indices, first index, first vertex."""
@@ -130,42 +132,63 @@ class Skins:
         self.release()
         return len(self._indices[-1]), first, base
 
-    def draw(self, stage: Pass, instances: moderngl.Buffer, commands: moderngl.Buffer, count: int, first: int) -> None:
+    def draw(
+        self,
+        stage: Pass,
+        shadows: bool,
+        instances: moderngl.Buffer,
+        commands: moderngl.Buffer,
+        count: int,
+        first: int,
+    ) -> None:
         """So many indirect draws, from the `first` on."""
         if not count:
             return
-        if self._arrays is None:
-            self._bind(instances)
-        assert self._arrays is not None
-        self._arrays[stage != "colour"].render_indirect(commands, moderngl.TRIANGLES, count=count, first=first)
+        if shadows not in self._arrays:
+            self._bind(shadows, instances)
+        array = self._arrays[shadows][stage != "colour"]
+        array.render_indirect(commands, moderngl.TRIANGLES, count=count, first=first)
 
     def release(self) -> None:
         """Free what is held on the graphics card; it is made anew when needed."""
-        for thing in self._held:
-            thing.release()
-        self._held, self._arrays = [], None
+        for array in (array for both in self._arrays.values() for array in both):
+            array.release()
+        for buffer in self._buffers:
+            buffer.release()
+        self._buffers, self._arrays = [], {}
 
-    def _bind(self, instances: moderngl.Buffer) -> None:
-        corner = self._context.buffer(np.concatenate(self._rows).tobytes())
-        index = self._context.buffer(np.concatenate(self._indices).tobytes())
-        content = [(corner, *self._layout), (instances, "1i4 1f4/i", "person", "girth")]
-        colour = self._context.vertex_array(self._drawn.colour, content, index, skip_errors=True)
-        shadow = self._context.vertex_array(self._drawn.shadow, content, index, skip_errors=True)
-        self._held, self._arrays = [colour, shadow, corner, index], (colour, shadow)
+    def _bind(self, shadows: bool, instances: moderngl.Buffer) -> None:
+        if not self._buffers:
+            rows, indices = np.concatenate(self._rows), np.concatenate(self._indices)
+            self._buffers = [self._context.buffer(held.tobytes()) for held in (rows, indices)]
+        corner, index = self._buffers
+        content = [(corner, *self._layout), (instances, "1i4 1i4 1f4/i", "person", "dress", "girth")]
+        colour, shadow = (
+            self._context.vertex_array(program, content, index, skip_errors=True) for program in self._drawn(shadows)
+        )
+        self._arrays[shadows] = colour, shadow
 
 
-def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody], shadows: bool) -> Skins:
+def mesh_skins(context: moderngl.Context, made: Callable[[int, int], SkinnedBody]) -> Skins:
     """Meshes, four joints to a corner."""
-    return Skins(context, made, programs(context, _SKIN + _MESH, _FRAGMENT, shadows), _MESH_LAYOUT)
+
+    def drawn(shadows: bool) -> Programs:
+        return programs(context, _SKIN + _MESH, _FRAGMENT, shadows)
+
+    return Skins(context, made, lru_cache(drawn), _MESH_LAYOUT)
 
 
-def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody], shadows: bool) -> Skins:
+def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -> Skins:
     """Tubes, two joints to a ring, four to one that is not turned."""
-    seen, cast = (
-        programs(context, f"#define TOWARDS ({ray})\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
-        for ray in ("middle - eye.xyz", "sun.xyz")
-    )
-    return Skins(context, made, Programs(seen.colour, cast.shadow), _TUBE_LAYOUT)
+
+    def drawn(shadows: bool) -> Programs:
+        seen, cast = (
+            programs(context, f"#define TOWARDS ({ray})\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
+            for ray in ("middle - eye.xyz", "sun.xyz")
+        )
+        return Programs(seen.colour, cast.shadow)
+
+    return Skins(context, made, lru_cache(drawn), _TUBE_LAYOUT)
 
 
 def _corners(made: SkinnedBody) -> NDArray[np.void]:

@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from physics.cameras.gl.corners import CornerRows, joined_corners
+from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT, SURFACES_UNIT, Pass, programs
 from physics.textures.facades import facade_layers
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Layers, joined_layers
 from physics.textures.walls import prop_layers, wall_layers
-from physics.world.mesh import Mesh
 
 SIZE_PX: Final = 256
 LAYERS_MAX: Final = 72
@@ -66,40 +65,65 @@ class SurfaceShaders:
                 uniform.write(surfaces.known)
 
 
-class TileBuffers:
-    """Meshes of one tile with their rows as vertices, uploaded once and drawn in their order. layout: of a row, as
-    moderngl wants it; middle: (2,) world metres of the tile's, from which positions are measured."""
+TileRows = tuple[CornerRows, NDArray[np.uint32]]
+"""Meshes of one tile joined in their order: rows of vertices, measured from the tile's middle, and triangles, flat."""
 
-    def __init__(
-        self,
-        context: moderngl.Context,
-        shaders: SurfaceShaders,
-        layout: tuple[str, ...],
-        parts: Sequence[tuple[Mesh, CornerRows]],
-        middle: Floats,
-    ) -> None:
-        self._middle, self._anchor = middle, np.full(2, np.nan)
-        self._place = context.buffer(reserve=16)
-        self._buffers = [self._place]
+
+class TileLayer:
+    """Meshes of the tiles around, uploaded when the tiles change; those in view are drawn in one call. layout: of a
+    row, as moderngl wants it."""
+
+    def __init__(self, context: moderngl.Context, shaders: SurfaceShaders, layout: tuple[str, ...]) -> None:
+        self._context, self._shaders, self._layout = context, shaders, layout
+        self._buffers: list[moderngl.Buffer] = []
         self._arrays: list[moderngl.VertexArray] = []
-        if parts:
-            rows, triangles = (context.buffer(held.tobytes()) for held in joined_corners(parts))
-            self._buffers += [rows, triangles]
-            content = [(rows, *layout), (self._place, "2f 2f /i", "middle", "middle_in_world")]
-            self._arrays = [context.vertex_array(one, content, triangles, skip_errors=True) for one in shaders.programs]
+        self._draws = np.zeros((0, 5), dtype=np.uint32)
+        self._counts = {"colour": 0, "still": 0}
 
-    def draw(self, stage: Pass, anchor: Floats) -> None:
-        if self._arrays and stage != "moving":
-            if anchor is not self._anchor:
-                self._anchor = anchor
-                self._place.write(np.concatenate([self._middle - anchor, self._middle]).astype(np.float32))
-            self._arrays[stage != "colour"].render()
+    def hold(self, tiles: Sequence[TileRows | None], middles: Floats) -> None:
+        """Replace all tiles. middles: (T, 2) world metres of each."""
+        self.release()
+        self._middles = middles
+        held = [tile for tile in tiles if tile is not None]
+        if not held:
+            return
+        ends = np.cumsum([(0, 0)] + [(len(t[0]), len(t[1])) if t else (0, 0) for t in tiles], axis=0)
+        self._draws = np.zeros((len(tiles), 5), dtype=np.uint32)
+        self._draws[:, 0], self._draws[:, 1], self._draws[:, 2:4] = np.diff(ends[:, 1]), 1, ends[:-1, ::-1]
+        self._draws[:, 4] = np.arange(len(tiles))
+        rows, triangles = (self._context.buffer(np.concatenate(part).tobytes()) for part in zip(*held, strict=True))
+        self._place = self._context.buffer(reserve=16 * len(tiles))
+        self._commands = {name: self._context.buffer(reserve=20 * len(tiles)) for name in self._counts}
+        self._buffers = [rows, triangles, self._place, *self._commands.values()]
+        content = [(rows, *self._layout), (self._place, "2f 2f /i", "middle", "middle_in_world")]
+        self._arrays = [
+            self._context.vertex_array(one, content, triangles, skip_errors=True) for one in self._shaders.programs
+        ]
+
+    def place(self, anchor: Floats) -> None:
+        """Measure all tiles from an anchor."""
+        if self._arrays:
+            self._place.write(np.hstack([self._middles - anchor, self._middles]).astype(np.float32))
+
+    def show(self, stage: Pass, tiles: NDArray[np.intp]) -> None:
+        """Draw these tiles from now on, in this order."""
+        if self._arrays:
+            draws = self._draws[tiles]
+            draws = draws[draws[:, 0] > 0]
+            self._commands[stage].write(draws)
+            self._counts[stage] = len(draws)
+
+    def draw(self, stage: Pass) -> None:
+        count = self._counts.get(stage, 0)
+        if count:
+            self._arrays[stage != "colour"].render_indirect(self._commands[stage], moderngl.TRIANGLES, count=count)
 
     def release(self) -> None:
         for array in self._arrays:
             array.release()
         for buffer in self._buffers:
             buffer.release()
+        self._arrays, self._buffers, self._counts = [], [], {"colour": 0, "still": 0}
 
 
 @lru_cache(maxsize=1)

@@ -24,17 +24,21 @@ class Target:
         self.size = size
         self._colour = context.renderbuffer(size, 4, dtype="f1")
         self._depth = context.depth_renderbuffer(size)
-        self.frame = context.framebuffer([self._colour], self._depth)
+        self.frame, self._painted = (context.framebuffer([self._colour], self._depth) for _ in range(2))
+        self._painted.color_mask, self._painted.depth_mask = (True, True, True, False), False
 
     def clear(self) -> None:
         """Nothing is seen, anywhere."""
-        self.use()
+        self.frame.use()
         self.frame.clear(depth=1.0)
 
-    def use(self, labels: bool = True, depth: bool = True) -> None:
-        """Draw into it from now on; what is False keeps what it holds."""
-        self.frame.color_mask, self.frame.depth_mask = (True, True, True, labels), depth
+    def use(self) -> None:
+        """Draw into it from now on."""
         self.frame.use()
+
+    def use_colours(self) -> None:
+        """Draw into it from now on: labels and depth keep what they hold."""
+        self._painted.use()
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Colours (H, W, 3) and labels (H, W), the top row first."""
@@ -48,7 +52,7 @@ class Target:
         return (FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)).astype(np.float32)
 
     def release(self) -> None:
-        for thing in (self.frame, self._colour, self._depth):
+        for thing in (self.frame, self._painted, self._colour, self._depth):
             thing.release()
 
 

@@ -1,4 +1,4 @@
-"""The ground of a tile as one static buffer, uploaded once; its materials are laid over it by world position."""
+"""The ground of tiles as one static buffer; its materials are laid over it by world position."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import moderngl
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.corners import LAYOUT, corners
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileBuffers
+from physics.cameras.gl.corners import LAYOUT, corners, joined_corners
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
 from physics.world.surface import Patch
 
 _TINTED: Final = 128
@@ -48,14 +48,17 @@ def tile_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool) -
     return SurfaceShaders(context, surfaces, _VERTEX, _FRAGMENT, shadows)
 
 
-def ground_buffers(
-    context: moderngl.Context, shaders: SurfaceShaders, patches: Sequence[Patch], middle: Floats
-) -> TileBuffers:
+def ground_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
+    """For what `ground_rows` makes."""
+    return TileLayer(context, shaders, LAYOUT)
+
+
+def ground_rows(surfaces: Surfaces, patches: Sequence[Patch], middle: Floats) -> TileRows | None:
     """Patches of one tile, drawn in their order. middle: (2,) world metres of the tile's."""
     parts = []
     for patch in patches:
         here = patch.mesh.moved((*-middle, 0.0))
         rows = corners(here, patch.colour, LABELS[patch.label] + (_TINTED if patch.tinted else 0))
-        rows["normal"][:, 3] = shaders.surfaces.surfaces.index(patch.layer)
+        rows["normal"][:, 3] = surfaces.surfaces.index(patch.layer)
         parts.append((here, rows))
-    return TileBuffers(context, shaders, LAYOUT, parts, middle)
+    return joined_corners(parts) if parts else None

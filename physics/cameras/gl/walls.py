@@ -1,4 +1,4 @@
-"""Buildings of a tile as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
+"""Buildings of tiles as one static buffer: walls of brick or plaster, laid over them bays of windows and fronts.
 
 What is drawn has the shape that physics.street.buildings gives it; which wall, which windows and which fronts a
 building has hangs on its name. Each bay of the upper storeys draws its own variant; a ground floor has one front all
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS
-from physics.cameras.gl.corners import CornerRows
+from physics.cameras.gl.corners import CornerRows, joined_corners
 from physics.cameras.gl.shading import FACADES_UNIT, FINISH_UNIT
-from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileBuffers
+from physics.cameras.gl.surfaces import Surfaces, SurfaceShaders, TileLayer, TileRows
 from physics.street.buildings import Building, facade_meshes
 from physics.street.fronts import NARROWEST_FRONT_M, face_of
 from physics.textures.facade_canvas import BAY_M, STOREY_M
@@ -96,17 +96,17 @@ def wall_shaders(context: moderngl.Context, surfaces: Surfaces, shadows: bool, n
     return SurfaceShaders(context, surfaces, _VERTEX, ("#define NIGHT\n" if night else "") + _FRAGMENT, shadows)
 
 
-def wall_buffers(
-    context: moderngl.Context,
-    shaders: SurfaceShaders,
-    buildings: Sequence[Building],
-    styles: Sequence[WallStyle],
-    middle: Floats,
-) -> TileBuffers:
+def wall_layer(context: moderngl.Context, shaders: SurfaceShaders) -> TileLayer:
+    """For what `wall_rows` makes."""
+    return TileLayer(context, shaders, _LAYOUT)
+
+
+def wall_rows(
+    surfaces: Surfaces, buildings: Sequence[Building], styles: Sequence[WallStyle], middle: Floats
+) -> TileRows | None:
     """The buildings of one tile, each of a style. middle: (2,) world metres of the tile's."""
-    styled = zip(buildings, styles, strict=True)
-    parts = [part for b, style in styled for part in _parts(b, style, shaders.surfaces, middle)]
-    return TileBuffers(context, shaders, _LAYOUT, parts, middle)
+    parts = [part for b, style in zip(buildings, styles, strict=True) for part in _parts(b, style, surfaces, middle)]
+    return joined_corners(parts) if parts else None
 
 
 def _parts(building: Building, style: WallStyle, surfaces: Surfaces, middle: Floats) -> list[tuple[Mesh, CornerRows]]:

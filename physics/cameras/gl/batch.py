@@ -1,0 +1,151 @@
+"""A batch: pictures of any number of environments, what moves in them posed, sorted out and uploaded together.
+
+Each picture is then drawn by itself, so that it has the same bits alone and in company.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache, partial
+from typing import Final, NamedTuple
+
+import moderngl
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.core.state import RobotState, Street
+from cosim.spec.robot import Robot
+from physics.cameras.gl.backdrop import Backdrop
+from physics.cameras.gl.crowd import CrowdDrawing, Watched
+from physics.cameras.gl.instances import Forms
+from physics.cameras.gl.lighting import Lighting
+from physics.cameras.gl.movers import Driven, Movers
+from physics.cameras.gl.scene import GlScene
+from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
+from physics.cameras.gl.shadows import TO_TEXTURE, ShadowMaps, casting
+from physics.cameras.gl.shots import Shots
+from physics.cameras.gl.surfaces import surfaces
+from physics.cameras.gl.targets import Target
+from physics.cameras.view import Shot
+from physics.world.surface import Surface
+
+_CLOCK: Final = Clock()
+_PEOPLE_MAX: Final = 4096
+"""People whose poses go up together; a picture of more is a batch of its own."""
+
+
+class Stage(NamedTuple):
+    """What a camera draws with: the standing street, its shadow maps if there are any, what lies behind, the light."""
+
+    surface: Surface
+    model: Robot
+    scene: GlScene
+    shadows: ShadowMaps | None
+    backdrop: Backdrop
+    light: Lighting
+
+
+class Picture(NamedTuple):
+    """A picture to be drawn. light: as this view sees it. robot: None where there is none; body: it is in the picture
+    itself, not its shadow alone."""
+
+    stage: Stage
+    taken: Shot
+    light: Lighting
+    street: Street
+    robot: RobotState | None
+    body: bool
+
+
+class BatchDrawing:
+    """Draws pictures. Made once in a context; it stays as long as it."""
+
+    def __init__(self, context: moderngl.Context) -> None:
+        self._context = context
+        self.forms = Forms(context, surfaces(context))
+        self._crowd, self._movers = CrowdDrawing(context), Movers(context, self.forms)
+        self._blocks = SceneBlocks(context)
+
+    def draw(self, pictures: Sequence[Picture], target: Target, drawn: Callable[[int], None]) -> None:
+        """Draw each into the target, and say so by its number before the next. The context must be held."""
+        first = 0
+        for few in _batches(pictures):
+            self._cast(few, self._arrange(few))
+            self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            self._context.front_face = "cw"  # pictures are drawn upside down, to be read top first
+            for i, picture in enumerate(few):
+                target.clear()
+                self._draw(i, picture.stage, target)
+                drawn(first + i)
+            first += len(few)
+
+    def _arrange(self, pictures: Sequence[Picture]) -> Shots:
+        shots = Shots([one.taken for one in pictures])
+        for one, middle, anchor in zip(pictures, shots.middles, shots.anchors, strict=True):
+            one.stage.scene.arrange(one.taken.view, middle, anchor, one.street)
+        watched, driven = [], []
+        for stage, _, _, street, robot, body in pictures:
+            surface, shadows = stage.surface, stage.shadows is not None
+            watched.append(Watched(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows))
+            driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
+        self._crowd.set(watched, shots)
+        self._movers.set(driven, shots)
+        self._blocks.room(2 * len(pictures))
+        for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
+            to_map: Floats = TO_TEXTURE
+            if one.stage.shadows is not None:
+                from_sun, to_map = one.stage.shadows.matrices(middle, anchor, one.stage.light)
+                self._blocks.put_sun(2 * i + 1, from_sun, one.stage.light)
+            self._blocks.put(2 * i, camera_matrix(one.taken, anchor), to_map, one.taken, anchor, one.light)
+        self._blocks.upload()
+        return shots
+
+    def _cast(self, pictures: Sequence[Picture], shots: Shots) -> None:
+        """Bring the shadow maps of all pictures up to date."""
+        with casting(self._context):
+            for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
+                if one.stage.shadows is not None:
+                    self._blocks.bind(2 * i + 1)
+                    draw = partial(self._draw_pass, i, one.stage)
+                    one.stage.shadows.draw(middle, anchor, one.stage.light, draw)
+
+    def _draw(self, i: int, stage: Stage, target: Target) -> None:
+        gl = self._context
+        if stage.shadows is not None:
+            stage.shadows.bind()
+        self._blocks.bind(2 * i)
+        gl.depth_func = "<"
+        self._draw_pass(i, stage, "colour")
+        # Paint changes colours alone: the ground keeps its labels and its depth.
+        gl.polygon_offset = -1.0, -8.0
+        target.use_colours()
+        stage.scene.draw_paint()
+        target.use()
+        gl.polygon_offset = 0.0, 0.0
+        gl.depth_func = "<="
+        stage.backdrop.draw()
+
+    def _draw_pass(self, i: int, stage: Stage, which: Pass) -> None:
+        shaded = stage.shadows is not None
+        self._crowd.draw(which, shaded, i)
+        stage.scene.draw(which)
+        self._movers.draw(which, shaded, i)
+
+
+@lru_cache(maxsize=1)
+def batch_drawing(context: moderngl.Context) -> BatchDrawing:
+    """The one of a context."""
+    return BatchDrawing(context)
+
+
+def _batches(pictures: Sequence[Picture]) -> Iterator[Sequence[Picture]]:
+    """The pictures in their order, in batches of at most so many people, no stage twice in one."""
+    begun, people, stages = 0, 0, set[int]()
+    for i, one in enumerate(pictures):
+        people += len(one.street.people)
+        if i > begun and (people > _PEOPLE_MAX or id(one.stage) in stages):
+            yield pictures[begun:i]
+            begun, people, stages = i, len(one.street.people), set()
+        stages.add(id(one.stage))
+    if begun < len(pictures):
+        yield pictures[begun:]

@@ -1,0 +1,127 @@
+"""Vehicles and robots of all pictures of a batch: sorted out together, uploaded together, drawn picture by picture."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Final, NamedTuple
+
+import moderngl
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.geometry import Floats
+from cosim.core.state import LABELS, RobotState, Vehicles
+from cosim.spec.robot import Robot
+from physics.cameras.gl.corners import CornerRows
+from physics.cameras.gl.instances import INSTANCE, Forms, Things, turned_instances
+from physics.cameras.gl.shading import Pass
+from physics.cameras.gl.shadows import SHADOW_REACH_M
+from physics.cameras.gl.shots import Shots
+from physics.cameras.view import VEHICLE_MARGIN_M
+from physics.robots import urdf_of
+from physics.robots.robot_body import robot_parts
+from physics.street import vehicles
+from physics.world.mesh import Part
+from physics.world.surface import Surface
+
+_PARTS: Final = {"colour": 0, "still": 1, "moving": 1}
+_FLEETS_MAX: Final = 256
+
+
+_Placed = tuple[NDArray[np.intp], CornerRows, NDArray[np.intp]]
+"""Forms, instances, and which part of the draws each belongs to: twice the picture, and one more for shadows."""
+
+
+class Driven(NamedTuple):
+    """The vehicles of a picture, and its robot if there is one to show: seen itself, or only its shadow. shadows:
+    whether there are any."""
+
+    vehicles: Vehicles
+    surface: Surface
+    model: Robot
+    robot: RobotState | None
+    body: bool
+    shadows: bool
+
+
+class Movers:
+    """What drives in the pictures of a batch."""
+
+    def __init__(self, context: moderngl.Context, forms: Forms) -> None:
+        self._forms, self._things = forms, Things(context, forms)
+        self._fleets: dict[tuple[tuple[str, ...], bytes], tuple[NDArray[np.intp], Floats]] = {}
+
+    def set(self, driven: Sequence[Driven], shots: Shots) -> None:
+        """Hold these vehicles and robots as the pictures will show them."""
+        placed = [self._vehicles(driven, shots), *self._robots(driven, shots)]
+        form, rows, part = (np.concatenate(column) for column in zip(*placed, strict=True))
+        self._things.set(form, rows, part, 2 * len(driven))
+
+    def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
+        if stage != "still":
+            self._things.draw(stage, shadows, 2 * picture + _PARTS[stage])
+
+    def release(self) -> None:
+        self._things.release()
+
+    def _vehicles(self, driven: Sequence[Driven], shots: Shots) -> _Placed:
+        whose = np.repeat(np.arange(len(driven)), [len(one.vehicles) for one in driven])
+        xy = np.concatenate([one.vehicles.xy for one in driven])
+        middle, shadows = shots.middle[whose], np.array([one.shadows for one in driven])[whose]
+        seen = shots.sees(whose, xy, VEHICLE_MARGIN_M)
+        casts = shadows & (np.hypot(xy[:, 0] - middle[:, 0], xy[:, 1] - middle[:, 1]) < SHADOW_REACH_M)
+        rows = np.concatenate([seen.nonzero()[0], casts.nonzero()[0]])
+        if not len(rows):
+            return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=INSTANCE), np.zeros(0, dtype=np.intp)
+        fleets = [self._fleet(one.vehicles) for one in driven]
+        form, paint = (np.concatenate(column) for column in zip(*fleets, strict=True))
+        lean = np.concatenate([_leaning(one) for one in driven])
+        heading = np.concatenate([one.vehicles.heading for one in driven])
+        at = np.column_stack([xy - shots.anchor[whose], lean[:, 0]])
+        placed = turned_instances(at, lean[:, 1], lean[:, 2], heading, paint, LABELS["vehicle"])
+        return form[rows], placed[rows], 2 * whose[rows] + (np.arange(len(rows)) >= seen.sum())
+
+    def _fleet(self, which: Vehicles) -> tuple[NDArray[np.intp], Floats]:
+        """(N,) forms of vehicles, and their (N, 3) paints."""
+        key = which.ids, which.size.tobytes()
+        if key not in self._fleets:
+            if len(self._fleets) >= _FLEETS_MAX:
+                self._fleets.clear()
+            forms = [self._form(name, *size) for name, size in zip(which.ids, which.size.tolist(), strict=True)]
+            paints = np.array([vehicles.paint(name) for name in which.ids]).reshape(-1, 3)
+            self._fleets[key] = np.array(forms, dtype=np.intp), paints
+        return self._fleets[key]
+
+    def _form(self, name: str, length_m: float, width_m: float) -> int:
+        size = tuple(np.array([length_m, width_m]).round(1).tolist())
+        shape = vehicles.shape(name, size[0])
+        return self._forms.id(("vehicle", shape, *size), partial(vehicles.vehicle_parts, shape, *size))
+
+    def _robots(self, driven: Sequence[Driven], shots: Shots) -> list[_Placed]:
+        """The robots, each with its base frame at its pose, leaning with the ground."""
+        forms, rows, parts = [], [], []
+        for k, (one, anchor) in enumerate(zip(driven, shots.anchors, strict=True)):
+            shown = [2 * k] * one.body + [2 * k + 1] * one.shadows
+            if one.robot is None or not shown:
+                continue
+            pose, (_, roll, pitch) = one.robot.pose, one.surface.lean(one.robot.pose, one.model.drive.span_m)
+            row = pose.x_m - anchor[0], pose.y_m - anchor[1], one.robot.z_m, roll, pitch, pose.heading_rad
+            form = self._forms.id(("robot", one.model.name), partial(_robot_parts, one.model))
+            forms += len(shown) * [form]
+            rows += len(shown) * [row]
+            parts += shown
+        if not rows:
+            return []
+        at = np.array(rows)
+        placed = turned_instances(at[:, :3], at[:, 3], at[:, 4], at[:, 5], (1.0, 1.0, 1.0), LABELS["robot"])
+        return [(np.array(forms), placed, np.array(parts))]
+
+
+def _robot_parts(model: Robot) -> Sequence[Part]:
+    return robot_parts(urdf_of(model))
+
+
+def _leaning(one: Driven) -> Floats:
+    """(N, 3) height, roll and pitch of vehicles on their wheels."""
+    return one.surface.road(one.vehicles.xy, one.vehicles.heading, one.vehicles.size)
