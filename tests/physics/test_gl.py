@@ -94,13 +94,16 @@ def same(one: Frame, other: Frame) -> bool:
 
 
 def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:
-    """The same state is the same picture, whatever was drawn before and in whatever camera."""
+    """The same state is the same picture, whatever was drawn before, far off or a step away, and in whatever camera."""
     robot, street = moment(world)
     with GlCamera(world, SPEC) as camera:
         first = camera.render(robot, street)
         for n in range(1, 6):
             camera.render(*moment(world, 9 * n))
         camera.picture((20.0, 30.0, 25.0), (60.0, 40.0, 0.0), street, robot, size=(64, 48))
+        for x, turn in ((-1.2, -0.09), (0.8, 0.05), (0.4, 0.02), (-0.3, -0.03)):
+            pose = Pose(robot.pose.x_m + x, robot.pose.y_m, robot.pose.heading_rad + turn)
+            camera.render(dataclasses.replace(robot, pose=pose), street)
         again = camera.render(robot, street)
     with GlCamera(world, SPEC) as other:
         fresh = other.render(robot, street)

@@ -15,7 +15,7 @@ from cosim.core.state import LABELS, Age, People
 from physics.cameras.gl import crowd as crowds
 from physics.cameras.gl.camera import NOON
 from physics.cameras.gl.context import available, context
-from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing, Watched
+from physics.cameras.gl.crowd import LEVEL_PX, CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
 from physics.cameras.gl.shots import Shots
@@ -53,7 +53,7 @@ def flat(xy: Floats) -> Floats:
 @contextmanager
 def drawing(crowd: CrowdDrawing, people: People, taken: Shot) -> Iterator[tuple[NDArray[np.uint8], NDArray[np.uint8]]]:
     gl, anchor = context(), anchor_of(taken.eye_m)
-    crowd.set([Watched(people, 2.0, flat, shadows=True)], Shots([taken]))
+    crowd.set([PeopleSeen(people, 2.0, flat, shadows=True)], Shots([taken]))
     blocks, target = SceneBlocks(gl), Target(gl, taken.size)
     blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, lighting_of(sky_of(NOON, 1)))
     blocks.upload()

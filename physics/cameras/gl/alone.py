@@ -13,7 +13,7 @@ from cosim.core.geometry import Floats, Pose
 from cosim.core.state import Frame, Street
 from cosim.spec.scenario import Light
 from physics.cameras.gl.context import context
-from physics.cameras.gl.crowd import CrowdDrawing, Watched
+from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.lighting import lighting_of
 from physics.cameras.gl.shading import SceneBlocks, anchor_of, camera_matrix
 from physics.cameras.gl.shots import Shots
@@ -58,7 +58,7 @@ class PeopleAlone:
         taken = shot(eye, eye + np.append(ahead, -0.1), self._size, self._fov_deg)
         shots, anchor = Shots([taken]), anchor_of(taken.eye_m)
         with self._context as gl:
-            self._crowd.set([Watched(street.people, Clock().time_s(street.tick), _flat, shadows=False)], shots)
+            self._crowd.set([PeopleSeen(street.people, Clock().time_s(street.tick), _flat, shadows=False)], shots)
             self._blocks.put(0, camera_matrix(taken, anchor), np.eye(4), taken, anchor, self._light)
             self._blocks.upload()
             self._blocks.bind()

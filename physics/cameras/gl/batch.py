@@ -16,7 +16,7 @@ from cosim.core.geometry import Floats
 from cosim.core.state import RobotState, Street
 from cosim.spec.robot import Robot
 from physics.cameras.gl.backdrop import Backdrop
-from physics.cameras.gl.crowd import CrowdDrawing, Watched
+from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lighting import Lighting
 from physics.cameras.gl.movers import Driven, Movers
@@ -86,7 +86,7 @@ class BatchDrawing:
         watched, driven = [], []
         for stage, _, _, street, robot, body in pictures:
             surface, shadows = stage.surface, stage.shadows is not None
-            watched.append(Watched(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows))
+            watched.append(PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows))
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
         self._crowd.set(watched, shots)
         self._movers.set(driven, shots)

@@ -71,7 +71,7 @@ void main() {
 """
 
 
-class Watched(NamedTuple):
+class PeopleSeen(NamedTuple):
     """The people of a picture. heights: of the ground at (N, 2) points; shadows: whether they throw any."""
 
     people: People
@@ -109,7 +109,7 @@ class CrowdDrawing:
         self._dyed_for: list[tuple[tuple[str, ...], bytes]] = []
         self._grow(_CROWD_MIN)
 
-    def set(self, watched: Sequence[Watched], shots: Shots) -> None:
+    def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
         """Hold these people as the pictures will show them, each on the ground; binds a framebuffer."""
         counts = [len(one.people) for one in watched]
         self._split = [[0, 0, 0, 0]] * len(watched)
@@ -233,7 +233,7 @@ class CrowdDrawing:
         self._held = []
 
 
-def _heights(watched: Sequence[Watched], whose: NDArray[np.intp], xy: Floats) -> Floats:
+def _heights(watched: Sequence[PeopleSeen], whose: NDArray[np.intp], xy: Floats) -> Floats:
     """(N,) height of the ground at (N, 2) points of these pictures, in their order; each ground is asked once."""
     grounds = list(dict.fromkeys(one.heights for one in watched))
     if len(grounds) == 1:
