@@ -19,13 +19,13 @@ from physics.cameras.gl.backdrop import Backdrop
 from physics.cameras.gl.crowd import CrowdDrawing, PeopleSeen
 from physics.cameras.gl.instances import Forms
 from physics.cameras.gl.lighting import Lighting
-from physics.cameras.gl.movers import Driven, Movers
 from physics.cameras.gl.scene import GlScene
 from physics.cameras.gl.shading import Pass, SceneBlocks, camera_matrix
 from physics.cameras.gl.shadows import TO_TEXTURE, ShadowMaps, casting
 from physics.cameras.gl.shots import Shots
 from physics.cameras.gl.surfaces import surfaces
 from physics.cameras.gl.targets import Target
+from physics.cameras.gl.traffic import Driven, TrafficDrawing
 from physics.cameras.view import Shot
 from physics.world.surface import Surface
 
@@ -45,7 +45,7 @@ class Stage(NamedTuple):
     light: Lighting
 
 
-class Picture(NamedTuple):
+class PictureOrder(NamedTuple):
     """A picture to be drawn. light: as this view sees it. robot: None where there is none; body: it is in the picture
     itself, not its shadow alone."""
 
@@ -63,10 +63,10 @@ class BatchDrawing:
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
         self.forms = Forms(context, surfaces(context))
-        self._crowd, self._movers = CrowdDrawing(context), Movers(context, self.forms)
+        self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
         self._blocks = SceneBlocks(context)
 
-    def draw(self, pictures: Sequence[Picture], target: Target, drawn: Callable[[int], None]) -> None:
+    def draw(self, pictures: Sequence[PictureOrder], target: Target, drawn: Callable[[int], None]) -> None:
         """Draw each into the target, and say so by its number before the next. The context must be held."""
         first = 0
         for few in _batches(pictures):
@@ -79,7 +79,7 @@ class BatchDrawing:
                 drawn(first + i)
             first += len(few)
 
-    def _arrange(self, pictures: Sequence[Picture]) -> Shots:
+    def _arrange(self, pictures: Sequence[PictureOrder]) -> Shots:
         shots = Shots([one.taken for one in pictures])
         for one, middle, anchor in zip(pictures, shots.middles, shots.anchors, strict=True):
             one.stage.scene.arrange(one.taken.view, middle, anchor, one.street)
@@ -89,7 +89,7 @@ class BatchDrawing:
             watched.append(PeopleSeen(street.people, _CLOCK.time_s(street.tick), surface.heights, shadows))
             driven.append(Driven(street.vehicles, surface, stage.model, robot, body, shadows))
         self._crowd.set(watched, shots)
-        self._movers.set(driven, shots)
+        self._traffic.set(driven, shots)
         self._blocks.room(2 * len(pictures))
         for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
             to_map: Floats = TO_TEXTURE
@@ -100,7 +100,7 @@ class BatchDrawing:
         self._blocks.upload()
         return shots
 
-    def _cast(self, pictures: Sequence[Picture], shots: Shots) -> None:
+    def _cast(self, pictures: Sequence[PictureOrder], shots: Shots) -> None:
         """Bring the shadow maps of all pictures up to date."""
         with casting(self._context):
             for i, (one, middle, anchor) in enumerate(zip(pictures, shots.middles, shots.anchors, strict=True)):
@@ -129,7 +129,7 @@ class BatchDrawing:
         shaded = stage.shadows is not None
         self._crowd.draw(which, shaded, i)
         stage.scene.draw(which)
-        self._movers.draw(which, shaded, i)
+        self._traffic.draw(which, shaded, i)
 
 
 @lru_cache(maxsize=1)
@@ -138,7 +138,7 @@ def batch_drawing(context: moderngl.Context) -> BatchDrawing:
     return BatchDrawing(context)
 
 
-def _batches(pictures: Sequence[Picture]) -> Iterator[Sequence[Picture]]:
+def _batches(pictures: Sequence[PictureOrder]) -> Iterator[Sequence[PictureOrder]]:
     """The pictures in their order, in batches of at most so many people, no stage twice in one."""
     begun, people, stages = 0, 0, set[int]()
     for i, one in enumerate(pictures):

@@ -17,7 +17,7 @@ from cosim.episode.ports import CameraSpec
 from cosim.spec.scenario import Light
 from physics.cameras.eyes import WorldCamera
 from physics.cameras.gl.backdrop import Backdrop
-from physics.cameras.gl.batch import Picture, Stage, batch_drawing
+from physics.cameras.gl.batch import PictureOrder, Stage, batch_drawing
 from physics.cameras.gl.context import context
 from physics.cameras.gl.lighting import Lighting, lighting_of
 from physics.cameras.gl.scene import GlScene
@@ -64,7 +64,7 @@ class GlCamera(WorldCamera):
                     self._targets.popitem()[1].release()
             self._context = None
 
-    def mounted_picture(self, robot: RobotState, street: Street) -> Picture:
+    def mounted_picture(self, robot: RobotState, street: Street) -> PictureOrder:
         """What `render` shows, but for the lens, to be drawn in a batch."""
         return self._picture(self._mounted(robot), street, robot, body=False)
 
@@ -80,10 +80,10 @@ class GlCamera(WorldCamera):
             batch_drawing(gl).draw([picture], target, read)
         return frames[0]
 
-    def _picture(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> Picture:
+    def _picture(self, taken: Shot, street: Street, robot: RobotState | None, body: bool) -> PictureOrder:
         if self._context is None:
             raise EngineError("the camera is not running: use GlCamera in a 'with' block")
-        return Picture(self._stage, taken, self._light_of(taken.view), street, robot, body)
+        return PictureOrder(self._stage, taken, self._light_of(taken.view), street, robot, body)
 
     def _light_of(self, view: View) -> Lighting:
         """The light of a view, its direction to a degree."""

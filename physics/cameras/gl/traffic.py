@@ -45,7 +45,7 @@ class Driven(NamedTuple):
     shadows: bool
 
 
-class Movers:
+class TrafficDrawing:
     """What drives in the pictures of a batch."""
 
     def __init__(self, context: moderngl.Context, forms: Forms) -> None:
