@@ -34,6 +34,9 @@ app = typer.Typer(
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
     epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`",
 )
+SHARED_HELP = (
+    "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
+)
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 
 
@@ -64,6 +67,7 @@ def common(
     "`cosim run long-horizon --robot scout --episodes 2`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
     "`cosim run long-horizon --policy route --episodes 2 --counterfactual`",
@@ -76,6 +80,7 @@ def run_command(
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    shared_renderer: Annotated[bool, typer.Option("--shared-renderer", help=SHARED_HELP)] = False,
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
     map_name: Annotated[
@@ -127,6 +132,7 @@ def run_command(
     from scenarios.execution.pool import run_all
     from scenarios.execution.process import LocalProcesses
     from scenarios.execution.suite_run import run_spec
+    from scenarios.rendering.shared import SharedRenderer, check_shared
 
     if map_name is not None:
         from scenarios.builders.sample import suite_on_map
@@ -165,7 +171,8 @@ def run_command(
         director=outside,
         counterfactual=counterfactual,
     )
-    spec = run_spec(whole, picked, policy, loaded, options)
+    asks = shared_renderer and check_shared(loaded, drawn_by)
+    spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:
         if on_air is not None:
             stack.enter_context(Session.hub(on_air.endpoint))
@@ -182,17 +189,23 @@ def run_command(
             words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         board = Board(picked, done, compared=counterfactual)
+        hello, patience = Hello(policy, manifest, loaded.source_hash), Patience(answer_timeout, start_timeout)
+        renderer = None
+        if shared_renderer and todo:
+            drawing = SharedRenderer(held.path / "logs", hello, asks=asks, patience=patience)
+            renderer = stack.enter_context(drawing)
         try:
             with board.bars, remembered(held, todo, jobs):
                 run_all(
                     held,
                     todo,
-                    Hello(policy, manifest, loaded.source_hash),
+                    hello,
                     LocalProcesses(held.path / "logs"),
                     jobs=jobs,
                     tell=board.tell,
                     options=options,
-                    patience=Patience(answer_timeout, start_timeout),
+                    patience=patience,
+                    renderer=renderer,
                 )
         except KeyboardInterrupt:
             finished = len(held.finished())

@@ -7,7 +7,8 @@ CosimError                what a user can mend: shown as one message
 ├── RunError           2  a run folder that is locked, broken or of another run
 ├── PolicyError        1  a policy that raised, or answered with something unusable
 ├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
-│   └── DirectorLost   3  the director of the event pedestrians did not answer
+│   ├── DirectorLost   3  the director of the event pedestrians did not answer
+│   └── RendererLost   3  the shared renderer has ended
 └── MachineError       3  a full disk, a folder that cannot be written, a library or program that is missing
 """
 
@@ -82,6 +83,15 @@ class EngineError(CosimError):
 
 class DirectorLost(EngineError):
     """The director of the event pedestrians did not answer in time."""
+
+
+class RendererLost(EngineError):
+    """The shared renderer has ended, or left this environment. number: which renderer of the run it was, 0 where that
+    is unknown; asked: what its policy was being asked for this environment, as "act at 3.20 s", "" if nothing."""
+
+    def __init__(self, number: int, asked: str = "") -> None:
+        super().__init__("the shared renderer has ended: its log in logs/ of the run folder says more")
+        self.number, self.asked = number, asked
 
 
 class MachineError(CosimError):

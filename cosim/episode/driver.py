@@ -9,17 +9,17 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Literal, Protocol
+from typing import Literal, Protocol, cast
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline
 from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
-from cosim.episode.ports import Manifest, Observation, Policy, Privileged
+from cosim.episode.ports import BatchPolicy, Manifest, Observation, Policy, Privileged
 
 PolicyCall = Literal["loading", "reset", "first act", "act"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
@@ -66,6 +66,11 @@ class Driver:
         self._timer: Timer = Untimed() if timer is None else timer
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
+
+    @property
+    def batches(self) -> bool:
+        """Whether the policy can answer for many episodes at once (`BatchPolicy`)."""
+        return callable(getattr(self._policy, "act_batch", None))
 
     @classmethod
     def of(cls, policy: Policy) -> Driver:
@@ -128,6 +133,57 @@ class Driver:
             crossings=known.crossings,
             free=known.free,
         )
+
+
+class BatchDriver:
+    """A `BatchPolicy` that can be asked for several episodes at once. What goes wrong with one answer is that episode's
+    crash; whatever the policy raises is the crash of all that it was asked for."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._policy = cast(BatchPolicy, driver._policy)
+        self._answered: set[str] = set()
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Tell the policy that another episode begins. Raises PolicyError for whatever it raises."""
+        self._answered.discard(scenario_id)
+        with self._driver._asked("reset", 0):
+            self._policy.reset(scenario_id, seed)
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command | PolicyError]:
+        """The policy's command for each observation, or what is wrong with it. The observations become the policy's
+        own."""
+        began = all(observation.episode in self._answered for observation in observations)
+        doing: PolicyCall = "act" if began else "first act"
+        last = max(observation.tick for observation in observations)
+        try:
+            with self._driver._asked(doing, last):
+                answers = _as_many(self._policy.act_batch(tuple(observations)), len(observations))
+        except PolicyError as error:
+            told = told_of(error.__cause__ or error)
+            return [self._crash(told, doing, one, len(observations)) for one in observations]
+        self._answered |= {observation.episode for observation in observations}
+        return [self._command(answer, doing, one) for answer, one in zip(answers, observations, strict=True)]
+
+    def _command(self, answer: object, doing: PolicyCall, seen: Observation) -> Command | PolicyError:
+        try:
+            with self._driver._asked(doing, seen.tick):
+                return command_of(answer, waypoint_dt_s=self._driver.manifest.waypoint_dt_s, robot=seen.robot)
+        except PolicyError as error:
+            return error
+
+    def _crash(self, told: str, doing: PolicyCall, seen: Observation, among: int) -> PolicyError:
+        together = f", asked for {among} episodes together" if among > 1 else ""
+        return PolicyError(f"policy '{self._driver.manifest.name}' {told} ({when(doing, seen.tick)}{together})")
+
+
+def _as_many(answers: Sequence[object], count: int) -> list[object]:
+    """The answers of a batch. Raises PolicyError unless there is one for each observation."""
+    if not hasattr(answers, "__len__") or not hasattr(answers, "__getitem__"):
+        raise PolicyError(f"answered a {type(answers).__name__}: a batch is answered with a sequence")
+    if len(answers) != count:
+        raise PolicyError(f"gave {len(answers)} answers to {count} observations")
+    return [answers[i] for i in range(count)]
 
 
 def when(doing: PolicyCall, tick: int) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -95,7 +95,8 @@ class Observation:
     """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds.
 
     tick, time_s: since the start of the episode; robot: which one it drives, the same from reset to the end: its size,
-    its pace, its limits; privileged: only for a manifest that declares it.
+    its pace, its limits; privileged: only for a manifest that declares it; episode: of which one it is: the scenario's
+    id, as `reset` was told.
 
     >>> from cosim.spec.robot import COURIER
     >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER).privileged is None
@@ -109,6 +110,7 @@ class Observation:
     w_radps: float
     robot: Robot
     privileged: Privileged | None = None
+    episode: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -152,6 +154,34 @@ class Policy(Protocol):
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating]:
         """A command, or waypoints (N, 2): x forward, y left, metres in the robot's frame."""
+
+
+class BatchPolicy(Policy, Protocol):
+    """A policy that can answer for many episodes at once; `cosim run --shared-renderer` asks it so.
+
+    One object, in the renderer's process, lives through all episodes of the run, of which several are under way at any
+    time. `reset` begins one of them; what the policy remembers of an episode it keeps under the scenario's id, which
+    every observation carries. Who is asked together is a matter of time and chance: an answer must depend on nothing
+    but its own episode. Without a shared renderer it is a policy like any other, asked by `act`.
+
+    A bad answer is the crash of its episode; whatever `act_batch` raises, also a number of answers that is not that of
+    the observations, is the crash of all that it was asked for.
+
+    >>> class Steady:
+    ...     manifest = Manifest("steady", camera=CameraSpec(96, 96))
+    ...
+    ...     def reset(self, scenario_id, seed): ...
+    ...
+    ...     def act(self, observation):
+    ...         return self.act_batch([observation])[0]
+    ...
+    ...     def act_batch(self, observations):
+    ...         pictures = np.stack([observation.rgb for observation in observations])  # (B, H, W, 3)
+    ...         return [Command(1.0, 0.0) for _ in pictures]
+    """
+
+    def act_batch(self, observations: Sequence[Observation]) -> Sequence[Command | NDArray[np.floating]]:
+        """For each observation, in their order, what `act` would answer."""
 
 
 class Crowd(Protocol):

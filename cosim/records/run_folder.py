@@ -49,7 +49,8 @@ SAME = (
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
     counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
-    that the policy is written in (`cosim.policies.load.source_hash`). robots: which drive, and the hash of each."""
+    that the policy is written in (`cosim.policies.load.source_hash`). robots: which drive, and the hash of each.
+    shared_renderer: whether one process drew for all others when it began; what comes out is the same."""
 
     suite: str
     robots: dict[str, str]
@@ -63,6 +64,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     versions: dict[str, str]
     renderer: str = "unknown"
     counterfactual: bool = False
+    shared_renderer: bool = False
     schema: int = 1
 
 

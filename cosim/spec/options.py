@@ -21,6 +21,14 @@ class Outside(msgspec.Struct, frozen=True, kw_only=True):
     wait_s: float
 
 
+class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
+    """The shared renderer of a run. address: where it listens; asks: whether the policy is there and asked there, for
+    all episodes together (`act_batch`)."""
+
+    address: str
+    asks: bool
+
+
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How an episode is run. But for the robot, options change what is seen and kept, never what happens in the street.
 
@@ -29,7 +37,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
     is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
     compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
-    one replays.
+    one replays. renderer: what draws for the policy in place of a camera of its own.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -44,3 +52,4 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     director: Outside | None = None
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
+    renderer: RendererAt | None = None

@@ -201,9 +201,8 @@ class Episode:
         self._frame = parts.camera.render(now.robot, now.street) if parts.camera is not None else None
         known = stage.known(now) if self.manifest.privileged else None
         rgb = self._frame.rgb if self._frame is not None else None
-        return Observation(
-            now.tick, self.clock.time_s(now.tick), rgb, now.robot.v_mps, now.robot.w_radps, stage.robot, known
-        )
+        v_mps, w_radps, time_s = now.robot.v_mps, now.robot.w_radps, self.clock.time_s(now.tick)
+        return Observation(now.tick, time_s, rgb, v_mps, w_radps, stage.robot, known, self.scenario.id)
 
     @property
     def _open(self) -> StagedScenario:

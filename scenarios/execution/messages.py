@@ -8,16 +8,18 @@ import msgspec
 
 from cosim.episode.ports import Manifest
 from cosim.records.record import Status
-from cosim.spec.options import EpisodeOptions
+from cosim.spec.options import EpisodeOptions, RendererAt
 from cosim.spec.scenario import Scenario
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
-    """The first message to a worker: which policy it drives with, and what that was for the run."""
+    """The first message to a worker: which policy it drives with, and what that was for the run. renderer: the run's
+    shared one, where there is one."""
 
     policy: str
     manifest: Manifest
     source_hash: str
+    renderer: RendererAt | None = None
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
@@ -69,6 +71,14 @@ class FrameDrawn(msgspec.Struct, frozen=True, tag=True):
     png: bytes
 
 
+class LostRenderer(msgspec.Struct, frozen=True, tag=True):
+    """The shared renderer has ended in the middle of the episode. number, asked: see `RendererLost`."""
+
+    scenario: str
+    number: int
+    asked: str
+
+
 class Done(msgspec.Struct, frozen=True, tag=True):
     """The episode is over. record, log: the bytes of its files, as `encoded` by Record and Log; a crash has no log."""
 
@@ -78,7 +88,7 @@ class Done(msgspec.Struct, frozen=True, tag=True):
     log: bytes = b""
 
 
-Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | Done
+Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | LostRenderer | Done
 Hear = Callable[[Message], None]
 
 encode_message = msgspec.msgpack.Encoder().encode

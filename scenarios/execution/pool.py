@@ -2,8 +2,8 @@
 
 A worker that dies (SUMO and PyBullet can take its process down) is replaced and its scenario tried once more; an engine
 that shows no sign of life is killed. After the last attempt the episode is recorded as crashed, so that none is ever
-lost. A policy that gives no answer in time is not asked again: its episode has crashed. What comes out of an episode is
-written here, by the run's own process.
+lost. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in time is
+not asked again: its episode has crashed. What comes out of an episode is written here, by the run's own process.
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ from functools import partial
 import msgspec
 
 from cosim.core.errors import MachineError, RunError, UsageError
-from cosim.records.record import Record, begun
+from cosim.records.record import Record, Status, begun
 from cosim.records.run_folder import RunFolder
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.execution.asked import Patience, Question
-from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Message, Ready, Unable
+from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Ready, Unable
 from scenarios.execution.transport import Transport, Worker
+from scenarios.rendering.shared import SharedRenderer
 
 ATTEMPTS = 2
 SILENCE_S = 300.0
@@ -41,12 +42,16 @@ def run_all(
     tell: Hear,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     patience: Patience = Patience(),  # noqa: B008  a frozen value
+    renderer: SharedRenderer | None = None,
 ) -> None:
     """Run scenarios, `jobs` at a time, adding each record to the folder as it ends.
 
-    hello: the policy as it was loaded here. Raises UsageError when a worker cannot load it, MachineError when none can
-    be started or a record cannot be written."""
-    pool = _Pool(folder, hello, transport, options, tell, patience)
+    hello: the policy as it was loaded here. renderer: what draws for all of them; the caller ends it. Raises UsageError
+    when a worker cannot load the policy, MachineError when none can be started or a record cannot be written."""
+    if renderer is not None:
+        hello = msgspec.structs.replace(hello, renderer=renderer.at)
+        options = msgspec.structs.replace(options, renderer=renderer.at)
+    pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
     waiting = deque(scenarios)
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
@@ -85,9 +90,12 @@ class _Pool:
         options: EpisodeOptions,
         tell: Hear,
         patience: Patience,
+        renderer: SharedRenderer | None,
     ) -> None:
         self._folder, self._hello, self._transport = folder, hello, transport
         self._options, self._tell, self._patience = options, tell, patience
+        self._renderer = renderer
+        self._bereft: list[tuple[Scenario, LostRenderer]] = []
         self._workers: list[_Slot] = []
         self._failed_starts = 0
 
@@ -106,6 +114,8 @@ class _Pool:
         """Take in what the workers say. Returns the scenarios whose worker was lost, and why; "" if it never began."""
         lost = []
         self._transport.wait(POLL_S)
+        if self._renderer is not None:
+            self._renderer.tend()
         for one in list(self._workers):
             if not one.worker.listen(partial(self._take, one)):
                 why = one.worker.end()
@@ -119,7 +129,24 @@ class _Pool:
             elif time.monotonic() - one.heard_at > SILENCE_S:
                 one.worker.kill()
                 lost += self._lost(one, "the environment process showed no sign of life")
+        while self._bereft:
+            lost += self._without_renderer(*self._bereft.pop())
         return lost
+
+    def _without_renderer(self, scenario: Scenario, lost: LostRenderer) -> list[tuple[Scenario, str]]:
+        """The shared renderer has ended in the middle of an episode, which is to be run again. It was an attempt if its
+        policy was being asked; if that gave no answer in time it was the last one."""
+        assert self._renderer is not None
+        end = self._renderer.end_of(lost.number)
+        if end is None:
+            return [(scenario, "the environment process lost its connection to the shared renderer")]
+        if lost.asked and end.unanswered_s is not None:
+            self.give_up(scenario, f"{self._silent(end.unanswered_s)} in {lost.asked} of {scenario.id}")
+            return []
+        return [(scenario, end.words if lost.asked else "")]
+
+    def _silent(self, allowed_s: float) -> str:
+        return f"policy '{self._hello.manifest.name}' gave no answer for {allowed_s:g} s"
 
     def _take(self, one: _Slot, message: Message) -> None:
         """Something that a worker has said."""
@@ -130,11 +157,14 @@ class _Pool:
             one.ready, self._failed_starts = True, 0
         elif isinstance(message, FrameDrawn):
             self._folder.keep_frame(message.scenario, message.tick, message.png)
-        elif not isinstance(message, Done):
+        elif not isinstance(message, Done | LostRenderer):
             self._tell(message)
         elif one.job is not None:
             scenario, one.job, one.ran = one.job, None, True
-            self._keep(scenario, message)
+            if isinstance(message, Done):
+                self._keep(scenario, message)
+            else:
+                self._bereft.append((scenario, message))
 
     def _keep(self, scenario: Scenario, done: Done) -> None:
         """The record of a scenario that is over, and its log, are written and told."""
@@ -146,7 +176,7 @@ class _Pool:
             self.give_up(scenario, "its record was damaged when it arrived")
         else:
             self._folder.keep(record, done.log)
-            self._tell(Done(scenario.id, record.status))
+            self._over(scenario, record.status)
 
     def _lost(self, one: _Slot, why: str, *, began: bool = True) -> list[tuple[Scenario, str]]:
         """A worker has ended. Returns its scenario if that is not done, and why, if it was begun."""
@@ -162,7 +192,7 @@ class _Pool:
         """The policy takes too long: its process is killed, and its episode has crashed, once."""
         one.worker.kill()
         self._workers.remove(one)
-        silent = f"policy '{self._hello.manifest.name}' gave no answer for {self._patience.of(question.doing):g} s"
+        silent = self._silent(self._patience.of(question.doing))
         if question.doing == "loading":
             raise UsageError(f"{silent} while it was loaded in an environment process: give a longer --start-timeout")
         self.give_up(scenario, f"{silent} in {question.when} of {scenario.id}")
@@ -181,7 +211,12 @@ class _Pool:
         """Record a scenario as crashed: no worker survives it, or the policy does not answer."""
         record = begun(scenario, self._hello.manifest, self._folder.spec.suite_hash, self._hello.source_hash)
         self._folder.keep(msgspec.structs.replace(record, reason=reason))
-        self._tell(Done(scenario.id, "crashed"))
+        self._over(scenario, "crashed")
+
+    def _over(self, scenario: Scenario, status: Status) -> None:
+        if self._renderer is not None:
+            self._renderer.episode_ended()
+        self._tell(Done(scenario.id, status))
 
     def close(self) -> None:
         """End every worker: idle ones by closing their pipe, busy ones by force."""

@@ -1,5 +1,5 @@
-"""The transport to environment processes of this machine: each is started, spoken with over a socket, and ended with
-everything that it has started."""
+"""Processes of this machine: each is started, spoken with over a socket, and ended with everything that it has started.
+Those that run episodes are a transport."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ from scenarios.execution.asked import Asked, Question
 from scenarios.execution.messages import Hear, Hello, Job, decode_message, encode_message
 from scenarios.execution.wire import Wire
 
+_WORKER: Final = "scenarios.execution.worker:serve_jobs"
 ENDING_S: Final = 10.0
 """What a process is left to end by itself, and then its shepherd to clear up."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.execution.shepherd import keep_worker; "
-    "keep_worker({pipe}, {asked}, {run})"
+    "keep_worker({serves!r}, {given}, {run})"
 )
 
 
@@ -34,11 +35,11 @@ class LocalProcesses:
     def __init__(self, logs: Path) -> None:
         self._logs = logs
         self._started = 0
-        self._processes: list[_Process] = []
+        self._processes: list[KeptProcess] = []
 
-    def start(self, hello: Hello) -> _Process:
-        process = _Process(self._logs / f"worker-{self._started}.log")
-        process.send(hello)
+    def start(self, hello: Hello) -> KeptProcess:
+        process = KeptProcess(self._logs / f"worker-{self._started}.log", _WORKER, "environment")
+        process.send(encode_message(hello))
         self._started += 1
         self._processes.append(process)
         return process
@@ -48,18 +49,20 @@ class LocalProcesses:
         wait([process.wire.fileno() for process in self._processes], timeout_s)
 
 
-class _Process:
-    """A shepherd and its worker (`scenarios.execution.shepherd`). open: it has not ended, as far as the run knows."""
+class KeptProcess:
+    """A shepherd and its worker (`scenarios.execution.shepherd`). serves: the function that is the worker; called: what
+    kind of process that is; also: descriptors that it is given besides. open: it has not ended, as far as the run
+    knows."""
 
-    def __init__(self, log: Path) -> None:
-        self.log, self.open = str(log), True
+    def __init__(self, log: Path, serves: str, called: str, also: tuple[int, ...] = ()) -> None:
+        self.log, self.open, self._called = str(log), True, called
         self._asked = Asked.new()
         self._last_asked: Question | None = None
         ours, theirs = socket.socketpair()
         self.wire = Wire(ours)
-        given = (theirs.fileno(), self._asked.descriptor)
+        given = (theirs.fileno(), self._asked.descriptor, *also)
         path = [str(Path(entry).absolute()) for entry in sys.path]
-        code = _CODE.format(path=path, pipe=given[0], asked=given[1], run=os.getpid())
+        code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid())
         try:
             with log.open("ab") as printed:
                 self._child = subprocess.Popen(
@@ -80,12 +83,12 @@ class _Process:
         return self._asked.question if self.open else self._last_asked
 
     def give(self, job: Job) -> None:
-        self.send(job)
+        self.send(encode_message(job))
 
-    def send(self, message: Hello | Job) -> None:
+    def send(self, message: bytes) -> None:
         """Say something. A process that died or was stopped while it was idle does not hear it."""
         with suppress(OSError):
-            self.wire.post(encode_message(message))
+            self.wire.post(message)
 
     def listen(self, hear: Hear) -> bool:
         with suppress(OSError):
@@ -117,7 +120,7 @@ class _Process:
             self._last_asked, self.open = self._asked.question, False
             self._asked.close()
         during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
-        return f"the environment process {_in_words(code)}{during}"
+        return f"the {self._called} process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:
         """Its exit code; None if it has not ended in time."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from cosim.core.errors import CosimError
+from cosim.core.errors import CosimError, RendererLost
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.log import Log
 from cosim.episode.ports import Policy
@@ -37,7 +37,8 @@ def run_episode(
     waiting: Callable[[str], None] = unheard,
     comparing: TellShare = untold_share,
 ) -> Outcome:
-    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`.
+    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`; but for a shared
+    renderer that has ended: then it raises RendererLost, and is to be run again.
 
     watches, waiting: see `Episode`. comparing: told how far the comparison with the street without the robot has come.
     """
@@ -51,6 +52,8 @@ def run_episode(
             drive(episode, driver)
             record, log = episode.result()
             entrances = episode.entrances
+    except RendererLost:
+        raise
     except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
         crashed = msgspec.structs.replace(episode.record, status="crashed", reason=in_words(error))
         return Outcome(crashed, None, traceback.format_exc())

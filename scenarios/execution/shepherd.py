@@ -12,6 +12,7 @@ It imports nothing but the standard library: it is small, and forks before there
 from __future__ import annotations
 
 import ctypes
+import importlib
 import os
 import resource
 import signal
@@ -32,11 +33,11 @@ KILLING_S = 10.0
 """A killed process is gone at once, unless the kernel holds it."""
 
 
-def keep_worker(pipe: int, asked: int, parent: int) -> None:
+def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
     """Run one worker and end as it ended.
 
-    pipe, asked: descriptors of its socket to the run and of `scenarios.execution.asked`. parent: process id of the
-    run. What the worker prints goes to this process's standard output."""
+    serves: the function that is the worker, as module:name; descriptors: what it is called with, of its socket to the
+    run first. parent: process id of the run. What the worker prints goes to this process's standard output."""
     end_with(parent, signal.SIGTERM)
     _prctl(PR_SET_CHILD_SUBREAPER, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -45,9 +46,9 @@ def keep_worker(pipe: int, asked: int, parent: int) -> None:
     pid = os.fork()
     if pid == 0:
         os.close(printed)
-        _be_worker(pipe, asked, prints, shepherd)
+        _be_worker(serves, descriptors, prints, shepherd)
         return
-    for descriptor in (pipe, asked, prints):
+    for descriptor in (*descriptors, prints):
         os.close(descriptor)
     log = threading.Thread(target=_keep, args=(printed, BoundedLog(1)), daemon=True)
     log.start()
@@ -133,7 +134,7 @@ def _ended(number: int, frame: FrameType | None) -> None:
     raise _Ended
 
 
-def _be_worker(pipe: int, asked: int, prints: int, shepherd: int) -> None:
+def _be_worker(serves: str, descriptors: tuple[int, ...], prints: int, shepherd: int) -> None:
     """What the forked child does, until its pipe is closed."""
     os.setsid()
     end_with(shepherd)
@@ -141,9 +142,8 @@ def _be_worker(pipe: int, asked: int, prints: int, shepherd: int) -> None:
     os.dup2(prints, 2)
     os.close(prints)
     sys.stdout.reconfigure(line_buffering=True)  # type: ignore[union-attr]
-    from scenarios.execution.worker import serve_jobs as work
-
-    work(pipe, asked)
+    module, _, function = serves.partition(":")
+    getattr(importlib.import_module(module), function)(*descriptors)
 
 
 def _status_of(pid: int) -> int:

@@ -29,6 +29,7 @@ from scenarios.execution.messages import Hello
 from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
 from scenarios.execution.transport import InProcess, Transport
+from scenarios.rendering.shared import SharedRenderer, check_shared
 
 
 def run(
@@ -41,6 +42,7 @@ def run(
     jobs: int = 1,
     out: str | Path | None = None,
     resume: bool = False,
+    shared_renderer: bool = False,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
 ) -> pd.DataFrame:
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
@@ -48,7 +50,8 @@ def run(
     suite: one that was loaded, or a name or path as for `load_suite`. policy: an object, which drives in this process,
     one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes that
     survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
-    out: the run folder, to be kept and resumed; without one only the table is.
+    out: the run folder, to be kept and resumed; without one only the table is. shared_renderer: one process draws for
+    all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`).
 
     Raises UsageError for names and options that do not exist, SpecError for scenarios that do not fit their places,
     RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
@@ -61,14 +64,16 @@ def run(
     picked = scenarios_chosen(whole, scenarios, episodes, events)
     check_places(whole, picked)
     driver = load_policy(policy) if isinstance(policy, str) else Driver.of(policy)
-    if not isinstance(policy, str) and jobs != 1:
+    if not isinstance(policy, str) and (jobs != 1 or shared_renderer):
+        asked = f"jobs={jobs}" if jobs != 1 else "shared_renderer=True"
         raise UsageError(
-            f"jobs={jobs} needs a policy by its name, such as 'package.module:Class': "
+            f"{asked} needs a policy by its name, such as 'package.module:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
     options = _settled(options, whole, driver)
-    spec = run_spec(whole, picked, name, driver, options)
+    asks = shared_renderer and check_shared(driver, chosen_camera(options.camera))
+    spec = run_spec(whole, picked, name, driver, options, shared_renderer)
     with ExitStack() as stack:
         folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
         held = RunFolder.resume(folder, spec) if resume else RunFolder.create(folder, spec, whole)
@@ -80,12 +85,18 @@ def run(
         else:
             transport = InProcess(driver)
         hello = Hello(name, driver.manifest, driver.source_hash)
-        run_all(held, todo, hello, transport, jobs=jobs, tell=_untold, options=options)
+        renderer = None
+        if shared_renderer and todo:
+            renderer = stack.enter_context(SharedRenderer(held.path / "logs", hello, asks=asks))
+        run_all(held, todo, hello, transport, jobs=jobs, tell=_untold, options=options, renderer=renderer)
         return held.finish()
 
 
-def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions) -> RunSpec:
-    """What a run is, for its folder. policy: its name. Raises UsageError when a robot has no mount for its camera."""
+def run_spec(
+    whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions, shared: bool = False
+) -> RunSpec:
+    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it. Raises UsageError when
+    a robot has no mount for its camera."""
     manifest, robots = driver.manifest, [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
@@ -103,6 +114,7 @@ def run_spec(whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driv
         versions=versions(),
         renderer=renderer_of(chosen_camera(options.camera)) if manifest.camera is not None else NO_RENDERER,
         counterfactual=options.counterfactual,
+        shared_renderer=shared,
     )
 
 

@@ -13,7 +13,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.episode.loop import Moment, Parts
-from cosim.episode.ports import CameraSpec, Eyes, Manifest, Privileged
+from cosim.episode.ports import Camera, CameraSpec, Eyes, Manifest, Privileged
 from cosim.place import overlay
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
@@ -32,6 +32,7 @@ from scenarios.execution.directing import director_of
 from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place
 from scenarios.execution.scorer import Scorer
+from scenarios.rendering.link import SharedCamera
 from scenarios.residents.director import among_residents
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.demand_log import Entrances
@@ -83,8 +84,13 @@ def staged(
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
             return camera_of(camera_of_choice(options.camera), world, spec, light=scenario.light)
 
-        camera, renderer = None, NO_RENDERER
-        if manifest.camera is not None:
+        camera: Camera | None = None
+        renderer = NO_RENDERER
+        if options.renderer is not None:
+            shared = stack.enter_context(SharedCamera(options.renderer, scenario))
+            if manifest.camera is not None:
+                camera, renderer = shared, shared.renderer
+        elif manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)

@@ -15,7 +15,7 @@ from socket import socket
 from typing import TYPE_CHECKING
 
 from cosim.core.clock import Clock
-from cosim.core.errors import UsageError
+from cosim.core.errors import RendererLost, UsageError
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
@@ -28,6 +28,7 @@ from scenarios.execution.messages import (
     Hear,
     Hello,
     Job,
+    LostRenderer,
     Message,
     Progress,
     Ready,
@@ -38,6 +39,7 @@ from scenarios.execution.messages import (
     encode_message,
 )
 from scenarios.execution.wire import Wire
+from scenarios.rendering.link import AskedElsewhere, link_to
 
 if TYPE_CHECKING:
     from scenarios.execution.episode import Watch
@@ -50,11 +52,11 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
     """Serve jobs until the socket closes. An exception outside an episode ends the process; its run starts another."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     wire, home = Wire(socket(fileno=socket_descriptor)), Path.cwd()
-    say = partial(_said, wire, os.getpid())
+    say = partial(said_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
     timer = Asked(asked_descriptor)
-    driver: Driver | None = _loaded(hello, timer, say)
+    driver: Driver | None = driver_here(hello, timer, say)
     say(Ready())
     while True:
         try:
@@ -62,7 +64,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
         except EOFError:
             return
         os.chdir(home)  # the policy may have gone elsewhere
-        driver = driver or _loaded(hello, timer, say)
+        driver = driver or driver_here(hello, timer, say)
         done, trouble = run_job(job, driver, say)
         if trouble:
             driver = None  # made anew for the next one
@@ -78,7 +80,14 @@ def _import_engines(say: Hear) -> None:
         raise
 
 
-def _loaded(hello: Hello, timer: Asked, say: Hear) -> Driver:
+def driver_here(hello: Hello, timer: Asked, say: Hear) -> Driver:
+    """What drives here: the policy, or who asks the shared renderer's."""
+    if hello.renderer is not None and hello.renderer.asks:
+        return AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
+    return policy_here(hello, timer, say)
+
+
+def policy_here(hello: Hello, timer: Asked, say: Hear) -> Driver:
     """The policy of the run. One that cannot be loaded here, or is another one here, is told, and ends the process."""
     try:
         driver = load_policy(hello.policy, timer)
@@ -95,20 +104,25 @@ def _loaded(hello: Hello, timer: Asked, say: Hear) -> Driver:
     return driver
 
 
-def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done, bool]:
+def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
     printed, because a record holds the message alone."""
     from scenarios.execution.run import run_episode
 
     name = job.scenario.id
-    outcome = run_episode(
-        job.scenario,
-        driver,
-        job.options,
-        watches=[_watcher(job, say)],
-        waiting=lambda reason: say(Waits(name, reason)),
-        comparing=lambda share: say(Compares(name, share)),
-    )
+    try:
+        if (shared := job.options.renderer) is not None:
+            link_to(shared.address).waiting = lambda: say(Waits(name, "waits for the shared renderer"))
+        outcome = run_episode(
+            job.scenario,
+            driver,
+            job.options,
+            watches=[_watcher(job, say)],
+            waiting=lambda reason: say(Waits(name, reason)),
+            comparing=lambda share: say(Compares(name, share)),
+        )
+    except RendererLost as lost:
+        return LostRenderer(name, lost.number, lost.asked), False
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
     log = b"" if outcome.log is None else outcome.log.encoded()
@@ -136,7 +150,7 @@ def _watcher(job: Job, say: Hear) -> Watch:
     return watch
 
 
-def _said(wire: Wire, worker: int, message: Message) -> None:
+def said_to_run(wire: Wire, worker: int, message: Message) -> None:
     """Say something to the run. When it is gone this process ends at once: that is no crash of the episode. So does a
     copy of the worker that its policy has forked: one process speaks on a socket."""
     try:

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import os
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NoReturn
 
 import numpy as np
@@ -15,7 +16,7 @@ from shapely.geometry import box
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
-from cosim.episode.driver import Driver, PolicyCall
+from cosim.episode.driver import BatchDriver, Driver, PolicyCall
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.spec.robot import COURIER
 
@@ -221,3 +222,74 @@ def test_a_policy_at_work_is_timed() -> None:
     with pytest.raises(PolicyError):
         driver.reset("bad", 0)
     assert told == [("reset", 0), None, ("first act", 0), None, ("act", 5), None, ("reset", 0), None]
+
+
+class Pair(Fake):
+    """Acts for many episodes as it is told."""
+
+    def act_batch(self, observations: Sequence[Observation]) -> Sequence[Command]:
+        return self.does(observations)  # type: ignore[arg-type, return-value]
+
+
+def of_two(does: Callable[[Sequence[Observation]], object]) -> list[Command | PolicyError]:
+    """What comes of an answer for two episodes, "a" at tick 2 and "b" at tick 4."""
+    driver = Driver(Pair(does))  # type: ignore[arg-type]
+    assert driver.batches and not Driver(Fake(lambda _: STILL)).batches
+    two = [dataclasses.replace(seen(tick), episode=name) for tick, name in ((2, "a"), (4, "b"))]
+    return BatchDriver(driver).act_batch(two)
+
+
+def test_a_batch_is_answered_in_its_order() -> None:
+    """With commands within the robot's limits, or with waypoints of each."""
+    assert of_two(lambda two: [Command(0.1 * one.tick, 9.0) for one in two]) == [
+        Command(0.2, COURIER.w_max_radps),
+        Command(0.4, COURIER.w_max_radps),
+    ]
+    assert of_two(lambda two: np.array([[[0.1, 0.0]], [[0.2, 0.0]]])) == [Command(0.4, 0.0), Command(0.8, 0.0)]
+
+
+def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
+    """The other one has its command."""
+    good, bad = of_two(lambda _: [STILL, Command(float("nan"), 0.0)])
+    assert good == STILL and "must be finite numbers (act at 0.20 s)" in str(bad)
+
+
+@pytest.mark.parametrize(
+    ("does", "told"),
+    [
+        (raising(KeyError("no such weight")), "raised KeyError: 'no such weight'"),
+        (raising(SystemExit(3)), "raised SystemExit: 3"),
+        (lambda _: [STILL], "gave 1 answers to 2 observations"),
+        (lambda two: (STILL for _ in two), "answered a generator: a batch is answered with a sequence"),
+        (lambda _: None, "answered a NoneType: a batch is answered with a sequence"),
+    ],
+    ids=["error", "exit", "one-too-few", "generator", "nothing"],
+)
+def test_what_is_no_answer_to_a_batch_is_the_crash_of_all_of_it(
+    does: Callable[[Sequence[Observation]], object], told: str
+) -> None:
+    """Each is told at its own time."""
+    assert [str(error) for error in of_two(does)] == [
+        f"policy 'mine' {told} (act at {time} s, asked for 2 episodes together)" for time in ("0.10", "0.20")
+    ]
+
+
+def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
+    """A question is a first one while one of its episodes has not been answered since its reset."""
+    asked: list[PolicyCall] = []
+
+    class Notes:
+        def starts(self, doing: PolicyCall, tick: int) -> None:
+            asked.append(doing)
+
+        def stops(self) -> None:
+            """Nothing to note."""
+
+    batch = BatchDriver(Driver(Pair(lambda two: [STILL for _ in two]), timer=Notes()))  # type: ignore[arg-type,misc]
+    one, two = (dataclasses.replace(seen(), episode=name) for name in ("a", "b"))
+    for observations in ([one], [one], [one, two], [one, two]):
+        batch.act_batch(observations)
+    batch.reset("b", 0)
+    batch.act_batch([one, two])
+    puts = [doing for doing, _ in itertools.groupby(asked)]
+    assert puts == ["first act", "act", "first act", "act", "reset", "first act"]

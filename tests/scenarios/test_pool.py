@@ -18,12 +18,14 @@ from cosim.episode.driver import PolicyCall
 from cosim.policies.load import load_policy
 from cosim.records.record import Record, begun
 from cosim.records.run_folder import RunFolder, RunSpec, read_records
+from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.execution import pool
 from scenarios.execution.asked import Asked, Patience, Question
-from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Message, Ready
+from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Ready
 from scenarios.execution.shepherd import BoundedLog
 from scenarios.execution.wire import Wire
+from scenarios.rendering.shared import End, SharedRenderer
 from tests.conftest import Cosim
 
 MODULES = {
@@ -191,13 +193,19 @@ SCENARIO = Scenario(
 )  # fmt: skip
 
 
-def pooled(folder: Path, *fakes: Fake, **named: float) -> Record:
+def pooled(folder: Path, *fakes: Fake, renderer: SharedRenderer | None = None, **named: float) -> Record:
     """The record of one scenario, run by these workers, one after the other."""
-    (record,) = all_pooled(folder, (SCENARIO,), *fakes, **named)
+    (record,) = all_pooled(folder, (SCENARIO,), *fakes, renderer=renderer, **named)
     return record
 
 
-def all_pooled(folder: Path, scenarios: tuple[Scenario, ...], *fakes: Fake, **named: float) -> list[Record]:
+def all_pooled(
+    folder: Path,
+    scenarios: tuple[Scenario, ...],
+    *fakes: Fake,
+    renderer: SharedRenderer | None = None,
+    **named: float,
+) -> list[Record]:
     """The same of several scenarios."""
     transport, suite, driver = (
         Prepared(*fakes),
@@ -211,8 +219,8 @@ def all_pooled(folder: Path, scenarios: tuple[Scenario, ...], *fakes: Fake, **na
     )  # fmt: skip
     hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
-        patience = Patience(**named)
-        pool.run_all(held, suite.scenarios, hello, transport, jobs=1, tell=lambda _: None, patience=patience)
+        given = {"tell": lambda _: None, "patience": Patience(**named), "renderer": renderer}
+        pool.run_all(held, suite.scenarios, hello, transport, jobs=1, **given)
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
 
@@ -280,6 +288,60 @@ def test_a_process_that_died_between_two_episodes_has_not_tried_the_second(tmp_p
     )
     fakes = (DiesIdle(Ready(), done), Fake(Ready(), ends=True), Fake(Ready(), again))
     assert [one.status for one in all_pooled(tmp_path, (SCENARIO, second), *fakes)] == ["invalid", "invalid"]
+
+
+class Ended(SharedRenderer):
+    """A renderer whose end a test has prepared; None: it goes on."""
+
+    def __init__(self, end: End | None) -> None:
+        self.at, self.end = RendererAt(address="nowhere", asks=True), end
+
+    def tend(self) -> None:
+        """It has ended already."""
+
+    def end_of(self, number: int) -> End | None:
+        return self.end
+
+    def episode_ended(self) -> None:
+        """It does not count."""
+
+
+HUNG, DIED = End("the renderer process was ended", 60.0), End("the renderer process ended with exit code 7")
+
+
+@pytest.mark.parametrize(
+    ("end", "asked", "lost", "reason"),
+    [
+        (DIED, "", 5, ""),
+        (DIED, "act at 3.20 s", 1, ""),
+        (DIED, "act at 3.20 s", 2, "the renderer process ended with exit code 7, 2 times; see logs/ in the run folder"),
+        (HUNG, "", 5, ""),
+        (HUNG, "act at 3.20 s", 1, "policy 'stop' gave no answer for 60 s in act at 3.20 s of s-0"),
+        (None, "", 2, "the environment process lost its connection to the shared renderer, 2 times; see logs/ in the "),
+    ],
+    ids=["died", "died-when-asked", "died-twice-when-asked", "hung", "hung-when-asked", "connection"],
+)
+def test_an_episode_is_no_attempt_the_less_for_a_renderer_that_died_for_others(
+    tmp_path: Path, end: End | None, asked: str, lost: int, reason: str
+) -> None:
+    """It is run again as often as that happens; a policy that takes the renderer down when it is asked for the episode
+    has used up an attempt of it, and one that does not answer all of them."""
+    data = msgspec.structs.replace(begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid").encoded()
+    losses = [LostRenderer("s-0", 1, asked)] * lost
+    over = () if reason else (Done("s-0", "done", data),)
+    fakes = Again(Ready(), *losses, *over)
+    record = pooled(tmp_path, fakes, renderer=Ended(end))
+    assert record.status == ("crashed" if reason else "invalid") and record.reason.startswith(reason)
+
+
+class Again(Fake):
+    """It says one thing after another, one for each time that it is listened to."""
+
+    def listen(self, hear: Hear) -> bool:
+        if self._messages:
+            hear(self._messages[0])
+            self._messages = self._messages[1:]
+        return True
 
 
 def test_processes_that_never_come_up_end_the_run(tmp_path: Path) -> None:

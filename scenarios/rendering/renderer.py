@@ -1,0 +1,305 @@
+"""The shared renderer: one process that draws for all environments of a run and, where the policy answers for many
+episodes at once, asks it.
+
+Environments connect, and ask for one thing at a time (`scenarios.rendering.exchange`). What waits is answered together
+as soon as every environment that runs a scenario waits, or after a moment. A picture is a function of robot and street
+alone, and each environment goes on when it has its own reply: who was drawn together changes nothing.
+"""
+
+from __future__ import annotations
+
+import os
+import selectors
+import signal
+import socket
+import struct
+import time
+import traceback
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import lru_cache, partial
+from typing import TYPE_CHECKING, Final
+
+import msgspec
+import shapely
+from shapely.geometry import MultiPolygon, Polygon
+
+from cosim.core.clock import Clock
+from cosim.core.errors import PolicyError
+from cosim.episode.driver import BatchDriver, said_by
+from cosim.episode.ports import Observation, Privileged
+from cosim.records.record import NO_RENDERER
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import Place, Scenario
+from physics.world.street_surface import StreetSurface
+from scenarios.execution.asked import Asked
+from scenarios.execution.messages import Ready
+from scenarios.execution.places import place
+from scenarios.execution.wire import Wire
+from scenarios.execution.wiring import world_of
+from scenarios.execution.worker import policy_here, said_to_run
+from scenarios.rendering.exchange import (
+    Ask,
+    Begin,
+    Draw,
+    Enter,
+    Fine,
+    Knowledge,
+    Leave,
+    Refused,
+    Reply,
+    Request,
+    Told,
+    Welcome,
+    decode_renderer_hello,
+    decode_request,
+    encode_exchange,
+)
+from scenarios.rendering.memory import PictureMemory
+
+if TYPE_CHECKING:
+    from physics.cameras.gl.atlas import Atlas, SeatKey
+
+_WINDOW_S: Final = 0.002
+"""What waits is answered after this time, whoever does not wait yet."""
+_BEAT_S: Final = 1.0
+_PLACES_KEPT: Final = 8
+_PEER: Final = struct.Struct("3i")
+"""Process, user and group of who has connected (SO_PEERCRED)."""
+
+
+def serve_pictures(pipe: int, asked: int, listening: int) -> None:
+    """Draw and ask until the run has gone. pipe, asked: as of a worker; listening: the descriptor of the socket that
+    environments connect to."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    wire = Wire(socket.socket(fileno=pipe))
+    say = partial(said_to_run, wire, os.getpid())
+    asked_for = decode_renderer_hello(wire.receive())
+    hello = asked_for.hello
+    driver = None
+    if hello.renderer is not None and hello.renderer.asks:
+        driver = BatchDriver(policy_here(hello, Asked(asked), say))
+    with ExitStack() as stack:
+        atlas, drawn_by, size = None, NO_RENDERER, (0, 0)
+        if (spec := hello.manifest.camera) is not None:
+            from physics.cameras.choice import renderer_of
+            from physics.cameras.gl.atlas import Atlas
+
+            atlas, drawn_by, size = stack.enter_context(Atlas(spec)), renderer_of("gl"), (spec.width, spec.height)
+        welcome = Welcome(asked_for.number, drawn_by, size)
+        _Renderer(welcome, atlas, driver, partial(say, Ready())).serve(socket.socket(fileno=listening), pipe)
+
+
+class _Environment:
+    """An environment process that has connected. scenario: which it runs, None for none; seat: its place in the atlas;
+    wants: what it waits for; free: where its robot may be."""
+
+    def __init__(self, end: socket.socket, size: tuple[int, int]) -> None:
+        self.wire, self.memory = Wire(end), PictureMemory.new(size)
+        self.scenario: Scenario | None = None
+        self.seat: SeatKey | None = None
+        self.wants: Draw | Begin | Ask | None = None
+        self.free: Polygon | MultiPolygon = MultiPolygon()
+        socket.send_fds(end, [b"\0"], [self.memory.descriptor])
+
+    @property
+    def name(self) -> str:
+        return "" if self.scenario is None else self.scenario.id
+
+    def reply(self, reply: Reply) -> None:
+        """Let it go on. One that has ended does not hear it: reading from it tells."""
+        self.wants = None
+        with suppress(OSError):
+            self.wire.post(encode_exchange(reply))
+
+    def close(self) -> None:
+        self.wire.close()
+        self.memory.close()
+
+
+class _Renderer:
+    """Answers environments until the run has gone. beat: tells the run that this is alive."""
+
+    def __init__(
+        self, welcome: Welcome, atlas: Atlas | None, driver: BatchDriver | None, beat: Callable[[], None]
+    ) -> None:
+        self._welcome, self._atlas, self._driver, self._beat = welcome, atlas, driver, beat
+        self._environments: list[_Environment] = []
+        self._selector = selectors.DefaultSelector()
+        self._since_s = 0.0
+        self._open = True
+
+    def serve(self, listening: socket.socket, pipe: int) -> None:
+        self._selector.register(listening, selectors.EVENT_READ, partial(self._welcomed, listening))
+        self._selector.register(pipe, selectors.EVENT_READ, self._ended)
+        beat_at_s = 0.0
+        while self._open:
+            if time.monotonic() >= beat_at_s:
+                self._beat()
+                beat_at_s = time.monotonic() + _BEAT_S
+            for key, _ in self._selector.select(self._left_s()):
+                key.data()
+            if self._left_s() <= 0.0:
+                self._answer()
+
+    def _left_s(self) -> float:
+        """How long may be waited for what else is asked; 0 when everybody waits who runs a scenario."""
+        running = [one for one in self._environments if one.scenario is not None]
+        if not any(one.wants for one in running):
+            return _BEAT_S
+        return 0.0 if all(one.wants for one in running) else self._since_s + _WINDOW_S - time.monotonic()
+
+    def _ended(self) -> None:
+        """The run has gone: it says nothing after its first message."""
+        self._open = False
+
+    def _welcomed(self, listening: socket.socket) -> None:
+        end, _ = listening.accept()
+        if _PEER.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _PEER.size))[1] != os.getuid():
+            end.close()
+            return
+        one = _Environment(end, self._welcome.size)
+        one.reply(self._welcome)
+        self._environments.append(one)
+        self._selector.register(end, selectors.EVENT_READ, partial(self._hear, one))
+
+    def _hear(self, one: _Environment) -> None:
+        """Something that an environment asks, or its end. One that does not speak as it should is left."""
+        try:
+            for message in one.wire.received():
+                if not self._take(one, decode_request(message)):
+                    self._part(one)
+                    return
+        except (EOFError, OSError, msgspec.DecodeError, ValueError, TypeError, shapely.errors.ShapelyError):
+            self._part(one)
+
+    def _part(self, one: _Environment) -> None:
+        self._leave(one)
+        self._selector.unregister(one.wire)
+        self._environments.remove(one)
+        one.close()
+
+    def _take(self, one: _Environment, request: Request) -> bool:
+        """Note what is asked. False when it is out of turn."""
+        if one.wants is not None:
+            return False
+        if isinstance(request, Enter):
+            self._leave(one)
+            one.reply(self._entered(one, request.scenario))
+        elif isinstance(request, Leave):
+            self._leave(one)
+        elif one.scenario is None or (self._atlas if isinstance(request, Draw) else self._driver) is None:
+            return False
+        else:
+            if isinstance(request, Ask) and request.known is not None and request.known.free:
+                one.free = _ground(request.known.free)
+            if not any(other.wants for other in self._environments):
+                self._since_s = time.monotonic()
+            one.wants = request
+        return True
+
+    def _entered(self, one: _Environment, scenario: Scenario) -> Reply:
+        try:
+            if self._atlas is not None:
+                world = world_of(_surface(scenario.place), scenario.barriers, robot_called(scenario.robot))
+                one.seat = self._atlas.join(world, scenario.light)
+        except Exception as error:  # noqa: BLE001  of one scenario: the others go on
+            return _refused(error)
+        one.scenario, one.free = scenario, MultiPolygon()
+        return Fine()
+
+    def _leave(self, one: _Environment) -> None:
+        if one.seat is not None and self._atlas is not None:
+            self._atlas.leave(one.seat)
+        one.scenario = one.seat = one.wants = None
+
+    def _answer(self) -> None:
+        """Answer all that waits."""
+        waiting = sorted((one for one in self._environments if one.wants is not None), key=lambda one: one.name)
+        self._draw([one for one in waiting if isinstance(one.wants, Draw)])
+        for one in waiting:
+            if isinstance(one.wants, Begin):
+                self._begin(one)
+        self._act([one for one in waiting if isinstance(one.wants, Ask)])
+
+    def _draw(self, which: list[_Environment]) -> None:
+        """Draw for these, together. Where that cannot be, by halves: it may be the fault of one of them."""
+        if not which or self._atlas is None:
+            return
+        wanted = [(one.seat, one.wants) for one in which]
+        looks = [
+            (seat, look.robot, look.street) for seat, look in wanted if isinstance(look, Draw) and seat is not None
+        ]
+        try:
+            frames = self._atlas.render(looks)
+        except Exception as error:  # noqa: BLE001  told to whom it concerns
+            if len(which) == 1:
+                which[0].reply(_refused(error))
+                return
+            self._draw(which[: len(which) // 2])
+            self._draw(which[len(which) // 2 :])
+            return
+        for one, frame in zip(which, frames, strict=True):
+            one.memory.put(frame)
+            one.reply(Fine())
+
+    def _begin(self, one: _Environment) -> None:
+        assert self._driver is not None and one.scenario is not None
+        one.memory.asked = True
+        try:
+            self._driver.reset(one.scenario.id, one.scenario.seed)
+            one.reply(Fine())
+        except PolicyError as error:
+            one.reply(Refused(str(error), by_policy=True))
+        one.memory.asked = False
+
+    def _act(self, which: list[_Environment]) -> None:
+        """Ask the policy for these, together."""
+        if not which or self._driver is None:
+            return
+        seen = [self._observed(one) for one in which]
+        for one in which:
+            one.memory.asked = True
+        for one, answer in zip(which, self._driver.act_batch(seen), strict=True):
+            if isinstance(answer, PolicyError):
+                one.reply(Refused(str(answer), by_policy=True))
+            else:
+                one.reply(Told(answer.v_mps, answer.w_radps))
+        for one in which:
+            one.memory.asked = False
+
+    def _observed(self, one: _Environment) -> Observation:
+        """What the policy is given for an environment."""
+        ask, scenario = one.wants, one.scenario
+        assert isinstance(ask, Ask) and scenario is not None
+        known = None if ask.known is None else _known(ask.known, scenario, one.free)
+        rgb = None if self._atlas is None else one.memory.take().rgb
+        robot, time_s = robot_called(scenario.robot), Clock().time_s(ask.tick)
+        return Observation(ask.tick, time_s, rgb, ask.v_mps, ask.w_radps, robot, known, scenario.id)
+
+
+def _known(told: Knowledge, scenario: Scenario, free: Polygon | MultiPolygon) -> Privileged:
+    people, vehicles, route = told.people, told.vehicles, scenario.route_line
+    return Privileged(told.robot, route, told.route_s_m, people, vehicles, told.signals, told.crossings, free)
+
+
+def _ground(wkb: bytes) -> Polygon | MultiPolygon:
+    """Where a robot may be. Raises ValueError when it is none."""
+    free = shapely.from_wkb(wkb)
+    if not isinstance(free, Polygon | MultiPolygon):
+        raise ValueError(f"a {type(free).__name__} is no ground")
+    shapely.prepare(free)
+    return free
+
+
+def _refused(error: Exception) -> Refused:
+    """Something of the renderer's own has failed for one environment."""
+    traceback.print_exception(error)
+    return Refused(f"the shared renderer: {type(error).__name__}: {said_by(error)}", by_policy=False)
+
+
+@lru_cache(maxsize=_PLACES_KEPT)
+def _surface(where: Place) -> StreetSurface:
+    """The surface of a place, one for all environments in it."""
+    _, street_map = place(where)
+    return StreetSurface(street_map, where.seed, where.roughness)

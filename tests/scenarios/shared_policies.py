@@ -1,0 +1,77 @@
+"""Policies for test_shared_renderer.py, in the processes of its runs: what they do depends on what they see."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+from cosim.core.state import Command
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+
+NOTES = "SHARED_NOTES"
+"""In the environment: a file that is told who is asked together, and by which process."""
+
+
+class Seeing:
+    """Drives by the brightness of its picture: another bit in it, another state hash."""
+
+    manifest = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(48, 32))
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        assert observation.rgb is not None
+        left, right = (float(half.mean()) for half in (observation.rgb[:, :24], observation.rgb[:, 24:]))
+        return Command(0.6 + left / 1000.0, (left - right) / 100.0)
+
+
+class Together(Seeing):
+    """The same, asked for all episodes at once."""
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
+        if NOTES in os.environ:
+            with Path(os.environ[NOTES]).open("a") as notes:
+                notes.write(f"{os.getpid()} {' '.join(one.episode for one in observations)}\n")
+        return [self.act(observation) for observation in observations]
+
+
+class Knowing:
+    """Blind and privileged; does what the name of the episode says, when it is asked for the third time."""
+
+    manifest = Manifest("knowing", rate_hz=4.0, camera=None, privileged=True)
+
+    def __init__(self) -> None:
+        self.count: dict[str, int] = {}
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        if scenario_id == "fails-in-reset":
+            raise FileNotFoundError("weights.pt")
+        self.count[scenario_id] = 0
+
+    def act(self, observation: Observation) -> Command:
+        known = observation.privileged
+        assert known is not None and known.route is not None and known.free.area > 0.0
+        assert known.robot.v_mps == observation.v_mps and known.people.xy.shape == (len(known.people), 2)
+        self.count[observation.episode] += 1
+        nearest = min(((known.people.xy - known.robot.pose.xy) ** 2).sum(axis=1), default=0.0)
+        command = Command(0.5 + 0.1 * nearest / (1.0 + nearest), 0.0)
+        return Command(float("nan"), 0.0) if self.now(observation, "nan") else command
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
+        answers = [self.act(observation) for observation in observations]
+        for observation in observations:
+            if self.now(observation, "raises"):
+                raise KeyError("no such weight")
+            if self.now(observation, "forgets-one"):
+                return answers[1:]
+            if self.now(observation, "hangs"):
+                time.sleep(3600)
+            if self.now(observation, "exits"):
+                os._exit(7)
+        return answers
+
+    def now(self, observation: Observation, name: str) -> bool:
+        return observation.episode == name and self.count[name] == 3

@@ -1,0 +1,292 @@
+"""One renderer for many environments: the same pictures, labels and hashes; and whoever dies, the others go on."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+
+import cosim
+from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
+from cosim.core.geometry import Pose
+from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
+from cosim.episode.driver import Driver
+from cosim.episode.ports import Policy
+from cosim.policies.load import load_policy
+from cosim.records.run_folder import RunFolder, read_records, read_spec
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Light, Scenario, Suite
+from scenarios.bench.cameras import busy_street
+from scenarios.checks import small_scenario
+from scenarios.execution.asked import Patience
+from scenarios.execution.messages import Hello, Message, Progress
+from scenarios.execution.places import place
+from scenarios.execution.pool import run_all
+from scenarios.execution.process import LocalProcesses
+from scenarios.execution.suite_run import run_spec
+from scenarios.rendering.exchange import Ask, Begin, Draw, Enter, Fine, Knowledge, Refused, Reply, Request, Told
+from scenarios.rendering.link import RendererLink
+from scenarios.rendering.memory import PictureMemory
+from scenarios.rendering.shared import End, SharedRenderer, check_shared
+from tests.scenarios.shared_policies import NOTES, Knowing, Seeing, Together
+
+OF = "tests.scenarios.shared_policies"
+FRAMES = EpisodeOptions(frames_every_s=0.5)
+
+
+def scenarios_of(*names: str) -> tuple[Scenario, ...]:
+    """A second of a long way in a small city, with another crowd for each name."""
+    one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
+    return tuple(msgspec.structs.replace(one, id=name, seed=i) for i, name in enumerate(names))
+
+
+def suite_of(*names: str) -> Suite:
+    return Suite(name="small", version="1", scenarios=scenarios_of(*names))
+
+
+@contextmanager
+def renderer_for(folder: Path, policy: Policy, patience: Patience = Patience()) -> Iterator[SharedRenderer]:  # noqa: B008
+    """A renderer in a process of its own, without a run."""
+    name = f"{OF}:{type(policy).__name__}"
+    driver = load_policy(name)
+    hello = Hello(name, driver.manifest, driver.source_hash)
+    with SharedRenderer(folder, hello, asks=driver.batches, patience=patience) as renderer:
+        yield renderer
+
+
+def linked(renderer: SharedRenderer) -> RendererLink:
+    return RendererLink(renderer.at.address, lambda: None)
+
+
+def renderer_pid(renderer: SharedRenderer) -> int:
+    """The process that draws: the only child of its shepherd."""
+    assert renderer._process is not None
+    shepherd = renderer._process._child.pid
+    (child,) = Path(f"/proc/{shepherd}/task/{shepherd}/children").read_text().split()
+    return int(child)
+
+
+def asked_together(renderer: SharedRenderer, links: Sequence[RendererLink], *requests: Request) -> list[Reply]:
+    """The replies to requests that the renderer finds waiting all at once: it is stopped while they are sent."""
+    pid = renderer_pid(renderer)
+    os.kill(pid, signal.SIGSTOP)
+    while Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "T":
+        time.sleep(0.001)
+    for link, request in zip(links, requests, strict=True):
+        link.tell(request)
+    os.kill(pid, signal.SIGCONT)
+    return [link._received() for link in links]
+
+
+def seen_by_itself(scenario: Scenario, robot: RobotState, streets: Sequence[Street]) -> list[Frame]:
+    """The pictures of a camera of its own."""
+    from cosim.spec.robot import robot_called
+    from physics.cameras.gl.camera import GlCamera
+    from physics.world.street_surface import StreetSurface
+    from physics.world.world import BulletWorld
+
+    spec = Seeing.manifest.camera
+    surface = StreetSurface(place(scenario.place)[1], scenario.place.seed)
+    world = BulletWorld(surface, scenario.barriers, robot_called(scenario.robot))
+    with GlCamera(world, spec, light=scenario.light) as camera:
+        return [camera.render(robot, street) for street in streets]
+
+
+@pytest.mark.engine
+def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -> None:
+    """Of environments of other robots and lights, drawn together for as long as they stay: one that ends and one that
+    speaks nonsense leave the others alone. Nothing has a name in /dev/shm, and all know when the renderer is killed."""
+    before = {*Path("/dev/shm").iterdir()}
+    (one,) = scenarios_of("one")
+    other = msgspec.structs.replace(one, id="other", robot="scout", light=Light(hour=19.0))
+    busy = busy_street(place(one.place)[1], persons=20, frames=4)
+    expected = [seen_by_itself(each, busy.robot, busy.streets) for each in (one, other)]
+    with renderer_for(tmp_path, Seeing()) as renderer:
+        links = [linked(renderer) for _ in range(3)]
+        for link, each in zip(links, (one, other, other), strict=True):
+            link.ask(Enter(each))
+        for k, street in enumerate(busy.streets):
+            replies = asked_together(renderer, links, *[Draw(busy.robot, street)] * len(links))
+            assert replies == [Fine()] * len(links)
+            for link, frames in zip(links, expected, strict=False):
+                picture = link.picture()
+                assert picture.rgb.tobytes() == frames[k].rgb.tobytes()
+                assert frames[k].labels is not None and picture.labels is not None
+                assert picture.labels.tobytes() == frames[k].labels.tobytes()
+            if k == 1:
+                links.pop()._wire.close()
+            if k == 2:
+                links.pop()._wire.send(b"nonsense")
+        assert expected[0][3].rgb.tobytes() != expected[1][3].rgb.tobytes() and len(links) == 1
+        with pytest.raises(EngineError, match="the shared renderer: MapError: "):
+            nowhere = msgspec.structs.replace(one.place, net_hash="elsewhere", seed=9)
+            linked(renderer).ask(Enter(msgspec.structs.replace(one, place=nowhere)))
+        pid = renderer_pid(renderer)
+        renderer.tend()
+        os.kill(pid, signal.SIGKILL)
+        with pytest.raises(RendererLost) as lost:
+            links[0].ask(Draw(busy.robot, busy.streets[0]))
+        assert (lost.value.number, lost.value.asked) == (1, "")
+        end = renderer.end_of(1)
+        assert end is not None and end.words == "the renderer process was killed by SIGKILL"
+        assert renderer.end_of(2) is None
+    assert {*Path("/dev/shm").iterdir()} == before
+
+
+def knows(tick: int, v_mps: float = 0.5) -> Ask:
+    """What the environment of a blind policy asks for at a tick."""
+    people = People.of(("c1",), [[3.0, 0.0]], [0.0], [1.0], ("walk",))
+    area = shapely.to_wkb(shapely.box(0.0, -1.0, 30.0, 1.0))
+    robot = RobotState(Pose(0.0, 0.0, 0.0), v_mps)
+    return Ask(tick, v_mps, 0.0, Knowledge(robot, 0.0, people, NO_VEHICLES, {}, (), area))
+
+
+@pytest.mark.engine
+def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
+    """Of episodes asked together: NaN and a reset that raises concern one of them; what act_batch raises, and an answer
+    too few, all; one that hangs or exits takes the renderer with it, and who was not asked knows that it was not."""
+    with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
+
+        def begun(*names: str) -> list[RendererLink]:
+            links = []
+            for scenario in scenarios_of(*names):
+                links.append(linked(renderer))
+                links[-1].ask(Enter(scenario))
+                links[-1].ask(Begin())
+            for tick in (0, 5):
+                told = asked_together(renderer, links, *[knows(tick)] * len(links))
+                assert told == [Told(0.59, 0.0)] * len(links)
+            return links
+
+        def third(*names: str) -> list[Reply]:
+            links = begun(*names)
+            replies = asked_together(renderer, links, *[knows(10)] * len(links))
+            for link in links:
+                link._wire.close()
+            return replies
+
+        honest, nan = third("honest", "nan")
+        assert honest == Told(0.59, 0.0) and isinstance(nan, Refused) and nan.by_policy
+        assert nan.reason == (
+            "policy 'knowing' answered Command(v_mps=nan, w_radps=0.0): both must be finite numbers (act at 0.50 s)"
+        )
+        for name, words in {
+            "raises": "raised KeyError: 'no such weight'",
+            "forgets-one": "gave 1 answers to 2 observations",
+        }.items():
+            together = f"policy 'knowing' {words} (act at 0.50 s, asked for 2 episodes together)"
+            assert third("honest", name) == [Refused(together, by_policy=True)] * 2
+        fails = linked(renderer)
+        fails.ask(Enter(*scenarios_of("fails-in-reset")))
+        with pytest.raises(PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt \(reset\)"):
+            fails.ask(Begin())
+        fails._wire.close()
+        renderer.tend()
+        for number, name in enumerate(("hangs", "exits"), start=1):
+            honest_one, other = begun("honest", name)
+            other.tell(knows(10))
+            while name == "hangs" and renderer.end_of(1) is None:
+                renderer.tend()
+            with pytest.raises(RendererLost) as lost:
+                other.reply("act at 0.50 s")
+            assert (lost.value.number, lost.value.asked) == (number, "act at 0.50 s")
+            with pytest.raises(RendererLost) as lost:
+                honest_one.reply("act at 0.50 s")
+            assert (lost.value.number, lost.value.asked) == (number, "")
+            assert renderer.end_of(number) == (
+                End("the renderer process was ended", 1.0)
+                if name == "hangs"
+                else End("the renderer process ended with exit code 7 in the policy's act at 0.50 s")
+            )
+
+
+@pytest.fixture(scope="module")
+def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of two episodes in this process, each drawing for itself."""
+    folder = tmp_path_factory.mktemp("runs") / "own"
+    cosim.run(suite_of("a", "b"), Seeing(), out=folder, options=FRAMES)
+    return folder
+
+
+def same(one: Path, other: Path) -> bool:
+    """Whether two runs have the same tables and hashes, and the same frames to the byte."""
+    hashes = [{record.scenario: record.state_hash for record in read_records(folder)} for folder in (one, other)]
+    frames = [{p.relative_to(f): p.read_bytes() for p in f.glob("episodes/*/frames/*.png")} for f in (one, other)]
+    assert len(set(hashes[0].values())) == 2 and len(frames[0]) == 4
+    return hashes[0] == hashes[1] and frames[0] == frames[1]
+
+
+@pytest.mark.engine
+def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
+    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes, drawn for and asked by a third: state hashes and pictures are those of episodes that each drew for
+    themselves, in one process; the run's folder says how it was run, and every question was put by one process."""
+    monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
+    folder = tmp_path / "shared"
+    suite = suite_of("a", "b")
+    cosim.run(suite, f"{OF}:Together", jobs=2, shared_renderer=True, out=folder, options=FRAMES)
+    assert same(by_themselves, folder) and read_spec(folder).shared_renderer
+    notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
+    assert len({line[0] for line in notes}) == 1 and sum(len(line) - 1 for line in notes) == 8
+    resumed = cosim.run(suite, f"{OF}:Together", out=folder, resume=True)
+    assert len(resumed) == 2
+
+
+@pytest.mark.engine
+def test_episodes_whose_renderer_is_killed_are_run_again(by_themselves: Path, tmp_path: Path) -> None:
+    """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none has crashed, and
+    what comes out is the same as ever."""
+    suite, name = suite_of("a", "b"), f"{OF}:Seeing"
+    driver = load_policy(name)
+    hello = Hello(name, driver.manifest, driver.source_hash)
+    options = msgspec.structs.replace(FRAMES, camera="gl", suite_hash=suite.content_hash)
+    killed = []
+
+    def kill(message: Message) -> None:
+        if isinstance(message, Progress) and not killed:
+            killed.append(renderer_pid(renderer))
+            os.kill(killed[0], signal.SIGKILL)
+
+    spec = run_spec(suite, suite.scenarios, name, driver, options, shared=True)
+    with RunFolder.create(tmp_path / "run", spec, suite) as folder:
+        transport, logs = LocalProcesses(folder.path / "logs"), folder.path / "logs"
+        with SharedRenderer(logs, hello, asks=False) as renderer:
+            run_all(folder, suite.scenarios, hello, transport, jobs=2, tell=kill, options=options, renderer=renderer)
+    assert killed and same(by_themselves, folder.path)
+    assert sorted(path.name for path in logs.iterdir()) == [
+        "renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log",
+    ]  # fmt: skip
+
+
+def test_where_there_is_nothing_to_share_it_is_said() -> None:
+    """A blind policy that is asked for each episode by itself, a camera that is not gl, a policy object: in words."""
+    assert check_shared(Driver(Together()), "gl") and not check_shared(Driver(Seeing()), "gl")
+    assert check_shared(Driver(Knowing()), "bullet")
+    with pytest.raises(UsageError, match="policy 'orca' has no camera and no method 'act_batch': leave --shared-rend"):
+        check_shared(load_policy("orca"), "bullet")
+    with pytest.raises(UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"):
+        check_shared(Driver(Seeing()), "bullet")
+    with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
+        cosim.run(suite_of("a"), Together(), shared_renderer=True)
+
+
+def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> None:
+    """The size is sealed; a picture that was taken stays when the next one comes."""
+    memory = PictureMemory.new((4, 2))
+    with pytest.raises(PermissionError):
+        os.ftruncate(memory.descriptor, 0)
+    rgb, labels = np.arange(24, dtype=np.uint8).reshape(2, 4, 3), np.full((2, 4), 9, np.uint8)
+    memory.put(Frame(rgb, labels))
+    taken = memory.take()
+    memory.put(Frame(rgb + 1, labels + 1))
+    assert taken.labels is not None and (taken.rgb == rgb).all() and (taken.labels == 9).all() and not memory.asked
+    memory.close()
