@@ -1,7 +1,7 @@
 """Zenoh sessions: the one place that imports zenoh.
 
-Queries and replies only, over one explicit endpoint: no scouting, no shared memory. A handler that raises answers
-with its error instead of silence.
+Queries and replies only, over one explicit endpoint or within one session: no scouting, no shared memory. A handler
+that raises answers with its error instead of silence.
 """
 
 from __future__ import annotations
@@ -49,9 +49,10 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
 class Session:
     """An open Zenoh session. Use as a context manager: a session left open keeps the process alive."""
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    def __init__(self, session: zenoh.Session, *, alone: bool = False) -> None:
+        self._session, self._alone = session, alone
         self._queryables: list[zenoh.Queryable[None]] = []
+        self._own: list[tuple[zenoh.Queryable[zenoh.Handler[zenoh.Query]], Callable[[zenoh.Query], None]]] = []
         self._subscribers: list[zenoh.Subscriber[None]] = []
 
     @classmethod
@@ -65,6 +66,12 @@ class Session:
         """A session that connects to a hub; it opens no port of its own."""
         remedy = "Is a process started that listens there, and is the endpoint the same?"
         return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy))
+
+    @classmethod
+    def alone(cls) -> Session:
+        """A session with nobody else in it and no socket. Queries that it serves are answered by the thread that asks:
+        no thread waits for another, and what interrupts the one that asks interrupts the handler."""
+        return cls(_open("peer", [], [], "cannot open a session", "Is the machine out of threads?"), alone=True)
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
@@ -86,11 +93,15 @@ class Session:
                 except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
-        self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
+        if self._alone:
+            self._own.append((self._session.declare_queryable(key, complete=True), answer))
+        else:
+            self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
         """Everybody's replies to one empty query on a key expression, by their keys; errors are left out."""
         replies = self._session.get(key, timeout=timeout_s)
+        self._answer_own()
         return {str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None}
 
     def tell(self, key: str, payload: bytes) -> None:
@@ -117,6 +128,7 @@ class Session:
             replies = self._session.get(
                 key, payload=payload, timeout=left_s, consolidation=zenoh.ConsolidationMode.NONE
             )
+            self._answer_own()
             for reply in replies:
                 if reply.ok is not None:
                     return bytes(reply.ok.payload.to_bytes())
@@ -127,12 +139,21 @@ class Session:
             pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
         raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")
 
+    def _answer_own(self) -> None:
+        """Answer what this session has just asked itself."""
+        for held, answer in self._own:
+            while (query := held.try_recv()) is not None:
+                answer(query)
+
     def close(self) -> None:
         """Close the session; closing twice is fine."""
         with suppress(zenoh.ZError):
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
             self._queryables.clear()
+            for held, _ in self._own:
+                held.undeclare()  # type: ignore[no-untyped-call]
+            self._own.clear()
             for subscriber in self._subscribers:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
             self._subscribers.clear()

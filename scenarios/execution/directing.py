@@ -1,21 +1,18 @@
 """Where the event pedestrians of an episode are decided: in a session beside it, or in a process of their own.
 
-By default an episode brings its director along: a Zenoh session of its own in the same process, over a Unix socket in a
-temporary folder, with no port and nobody else in it. `cosim direct` serves any number of runs and episodes from outside
+By default an episode brings its director along: a Zenoh session with nobody else in it, which asks and answers in the
+same thread, with no socket. `cosim direct` serves any number of runs and episodes from outside
 (`cosim run --director ENDPOINT`). Both are asked over Zenoh at every tick, and both give the same bits.
 """
 
 from __future__ import annotations
 
 import ast
-import fcntl
 import hashlib
 import importlib.util
-import shutil
-import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Final
@@ -31,10 +28,6 @@ from cosim.spec.options import Outside
 from scenarios.events import EVENT_KINDS, react
 
 RETRY_S: Final = 0.2
-LEFT_S: Final = 60.0
-"""A folder that is younger may be one that an episode is only beginning to use."""
-_FOLDER: Final = "cosim-zenoh-"
-_SOCKET: Final = "hub.sock"
 _OURS: Final = ("cosim.", "scenarios.")
 
 
@@ -47,14 +40,11 @@ def director_of(
 
 @contextmanager
 def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
-    """A director of event pedestrians and the simulator's end of it, each with a Zenoh session of its own."""
-    with ExitStack() as stack:
-        _sweep(Path(tempfile.gettempdir()))
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix=_FOLDER))
-        endpoint = f"unixsock-stream/{folder}/{_SOCKET}"
-        key = keys.director("local", keys.chunk(episode))
-        serve_director(stack.enter_context(Session.hub(endpoint)), key, partial(react, kinds=kinds))
-        yield RemoteDirector(stack.enter_context(Session.client(endpoint)), key)
+    """A director of event pedestrians and the simulator's end of it, both in one Zenoh session."""
+    key = keys.director("local", keys.chunk(episode))
+    with Session.alone() as session:
+        serve_director(session, key, partial(react, kinds=kinds))
+        yield RemoteDirector(session, key)
 
 
 @contextmanager
@@ -108,16 +98,6 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
                 rooms = other.split(".")
                 for depth in range(2, len(rooms) + 1):  # the rooms that it lies in are loaded before it
                     _gather(".".join(rooms[:depth]), found)
-
-
-def _sweep(temporary: Path) -> None:
-    """Remove the folders of episodes that were killed: nobody holds the lock that Zenoh lays beside a socket."""
-    for lock in temporary.glob(f"{_FOLDER}*/{_SOCKET}.lock"):
-        with suppress(OSError):  # another user's, held, or gone meanwhile
-            if time.time() - lock.parent.stat().st_mtime > LEFT_S:
-                with lock.open("r+b") as file:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    shutil.rmtree(lock.parent)
 
 
 def _reached(outside: Outside, waiting: Waiting) -> Session:

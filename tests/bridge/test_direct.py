@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import sys
-import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -22,7 +20,6 @@ from cosim.episode.ports import Manifest, Observation
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
-from scenarios.execution.directing import directed
 from tests.conftest import PATIENCE_S, Cosim
 
 pytestmark = pytest.mark.engine
@@ -262,42 +259,3 @@ def test_the_version_of_the_behaviours_covers_all_of_ours_that_they_load() -> No
     ours = {name for name in loaded if name.startswith(("cosim.", "scenarios."))}
     assert {"scenarios.events.frontal", "cosim.spec.events"} < ours <= set(sources("scenarios.events"))
     assert len(behaviours()) == 16 and behaviours() == behaviours()
-
-
-HELD = """
-import sys, time
-from scenarios.execution.directing import directed
-with directed(sys.argv[1]):
-    print("here", flush=True)
-    time.sleep(3600.0)
-"""
-
-
-def test_the_folder_of_an_episode_that_was_killed_goes_when_the_next_one_begins(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Once it is old enough; not that of an episode that runs, and nothing else."""
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    lasting = tmp_path / "cosim-zenoh-notes"
-    lasting.mkdir()
-    folders: list[Path] = []
-    processes: list[subprocess.Popen[str]] = []
-    try:
-        for name in ("killed", "running"):
-            words, environment = [sys.executable, "-c", HELD, name], os.environ | {"TMPDIR": str(tmp_path)}
-            processes.append(subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=environment))
-            assert processes[-1].stdout is not None and processes[-1].stdout.readline() == "here\n"
-            folders += {*tmp_path.glob("cosim-zenoh-*")} - {lasting, *folders}
-        killed, running = folders
-        processes[0].kill()
-        processes[0].wait()
-        with directed("young"):
-            assert killed.is_dir()
-        for folder in folders:
-            os.utime(folder, (0.0, 0.0))
-        with directed("next"):
-            assert not killed.exists() and (running / "hub.sock").exists() and lasting.is_dir()
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +47,53 @@ def test_every_tick_is_answered_in_lockstep(tmp_path: Path) -> None:
         serve_director(hub, KEY, echo)
         director = RemoteDirector(client, KEY)
         assert [director.react(query(tick)).tick for tick in range(1000)] == list(range(1000))
+
+
+def open_sockets() -> set[str]:
+    """The sockets of this process."""
+    links = []
+    for file in Path("/proc/self/fd").iterdir():
+        with suppress(OSError):  # the folder's own, closed by now
+            links.append(str(file.readlink()))
+    return {link for link in links if link.startswith("socket:")}
+
+
+def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
+    """Over a Zenoh session that has no socket: what it says is what the pure function says, tick by tick."""
+    before, threads = open_sockets(), set()
+
+    def seen(asked: EventQuery) -> EventReply:
+        threads.add(threading.get_ident())
+        return echo(asked)
+
+    with Session.alone() as session:
+        serve_director(session, KEY, seen, by="cafe")
+        director = RemoteDirector(session, KEY, by="cafe")
+        assert [director.react(query(tick)) for tick in range(100)] == [echo(query(tick)) for tick in range(100)]
+        assert open_sockets() == before and threads == {threading.get_ident()}
+        with pytest.raises(DirectorLost, match="'feed' met behaviours 'cafe'"):
+            RemoteDirector(session, KEY, by="feed").react(query())
+        with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
+            RemoteDirector(session, keys.director("test", "nobody"), wait_s=0.5).react(query())
+
+
+def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
+    """It interrupts whoever asked, as anywhere else; an exception is an answer; the next query works."""
+    raised: list[BaseException] = [KeyboardInterrupt(), RuntimeError("no idea")]
+
+    def broken(asked: EventQuery) -> EventReply:
+        if raised:
+            raise raised.pop(0)
+        return echo(asked)
+
+    with Session.alone() as session:
+        serve_director(session, KEY, broken)
+        director = RemoteDirector(session, KEY)
+        with pytest.raises(KeyboardInterrupt):
+            director.react(query(1))
+        with pytest.raises(DirectorLost, match=r"tick 2 of 't'.*RuntimeError: no idea"):
+            director.react(query(2))
+        assert director.react(query(3)).tick == 3
 
 
 def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> None:
