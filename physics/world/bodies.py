@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal
 
 from cosim.core.errors import EngineError
-from cosim.core.geometry import Floats, Pose
+from cosim.core.geometry import Pose
 from cosim.core.state import PERSON_RADIUS_M, RobotState
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
@@ -16,6 +16,7 @@ from physics.street.buildings import Building, Wall
 from physics.street.furniture import Prop, solids_of
 from physics.world.bullet import p
 from physics.world.mesh import Mesh, as_lists, join
+from physics.world.movers import Mover, TickPoses
 from physics.world.surface import Chunk
 from physics.world.tiles import CURB_M
 
@@ -25,6 +26,9 @@ WALL_M: Final = 0.2
 """How thick the walls of mapped buildings are."""
 
 FAR_BELOW_M: Final = -50.0
+_AROUND_M: Final = 0.5
+"""What stands around the robot is looked up anew when it has moved by so much."""
+_NOWHERE: Final = (math.inf, math.inf, math.inf)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _TYRE: Final = {
     "lateralFriction": 1.0,
@@ -37,10 +41,16 @@ friction cone, skid turns come in jerks."""
 
 BodyKind = Literal["pedestrian", "vehicle", "wall", "object"]
 Moving = Literal["pedestrian", "vehicle"]
+_Placing = tuple[tuple[float, float, float], tuple[float, float, float, float]]
+"""Where the middle of a body comes to be, and its attitude as a quaternion."""
 
 
 class Bodies:
-    """A running engine. Bodies that are not shown wait far below the ground for their next use."""
+    """A running engine. Bodies that are not led wait far below the ground.
+
+    at_m: where the robot's base frame is; yaw_rate_radps: its rate of turn about the vertical; watched: the bodies that
+    `robot_contacts` asks for.
+    """
 
     def __init__(self, robot: Robot, substep_s: float) -> None:
         self._client: int = p.connect(p.DIRECT)
@@ -50,7 +60,12 @@ class Bodies:
         self._what: dict[int, tuple[BodyKind, str]] = {}
         self._pools: dict[Any, list[int]] = {}
         self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
-        self._z: dict[Moving, list[float]] = {"pedestrian": [], "vehicle": []}
+        self._led: dict[Moving, dict[int, list[_Placing]]] = {"pedestrian": {}, "vehicle": {}}
+        self.at_m, self.yaw_rate_radps = _NOWHERE, 0.0
+        self._looked_from = _NOWHERE
+        self._around: dict[int, Any] = {}
+        self.watched: list[int] = []
+        self._asked_radps: list[float] = []
         self._shapes: dict[Any, int] = {}
         self._do("setGravity", 0.0, 0.0, -9.81)
         self._do(
@@ -68,12 +83,14 @@ class Bodies:
         self._do("changeDynamics", self._robot, -1, lateralFriction=0.4, linearDamping=0.0, angularDamping=0.0)
         for wheel in self._wheels:
             self._do("changeDynamics", self._robot, wheel, linearDamping=0.0, angularDamping=0.0, **_TYRE)
+        self._read()
 
     def close(self) -> None:
         p.disconnect(self._client)
 
     def add_chunk(self, chunk: Chunk) -> list[int]:
         """What is in a square of a surface; returns what `remove` takes."""
+        self._looked_from = _NOWHERE
         of_friction: dict[float, list[Mesh]] = {}
         for patch in chunk.ground:
             of_friction.setdefault(patch.friction, []).append(patch.mesh)
@@ -130,35 +147,48 @@ class Bodies:
         return body
 
     def remove(self, bodies: Sequence[int]) -> None:
+        self._looked_from = _NOWHERE
         for body in bodies:
             self._do("removeBody", body)
             self._what.pop(body, None)
 
-    def show(self, kind: Moving, ids: Sequence[str], z_m: Floats, size_m: Floats | None = None) -> None:
-        """Let exactly these people or vehicles be there; z_m: (N,) height of the ground under each; size_m: (N, 2)."""
-        shown = self._shown[kind]
-        for name in [name for name in shown if name not in set(ids)]:
+    def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
+        """Let exactly these people or vehicles have a body, which waits until it is led."""
+        shown, ids = self._shown[kind], [mover.id for mover in movers]
+        if list(shown) == ids:
+            return
+        for name in [name for name in shown if name not in ids]:
             body, pool = shown.pop(name)
             self._what.pop(body)
             self._pools[pool].append(body)
-            self._do("resetBasePositionAndOrientation", body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT)
-        for i, name in enumerate(ids):
-            if name not in shown:
-                pool = kind if size_m is None else (kind, float(size_m[i, 0]), float(size_m[i, 1]))
+            self._park(body)
+        for mover in movers:
+            if mover.id not in shown:
+                pool = kind if kind == "pedestrian" else (kind, *mover.size_m)
                 body = self._taken(pool)
-                shown[name] = (body, pool)
-                self._what[body] = (kind, name)
-        self._z[kind] = [float(z) for z in z_m]
+                shown[mover.id] = (body, pool)
+                self._what[body] = (kind, mover.id)
         self._shown[kind] = {name: shown[name] for name in ids}
 
-    def move(self, kind: Moving, poses: Floats) -> None:
-        """Put what is shown at (N, 3) x, y, heading, in the order of `show`."""
+    def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
+        """Let these of the shown go their ways, substep by substep (`step`); the others wait. z_m: height of the ground
+        under each."""
+        if not ways and not self._led[kind]:
+            return
+        bodies = [self._shown[kind][mover.id][0] for mover in ways]
+        for body in self._led[kind].keys() - set(bodies):
+            self._park(body)
         half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
-        for (body, _), z, (x, y, heading) in zip(
-            self._shown[kind].values(), self._z[kind], poses.tolist(), strict=True
-        ):
-            turn = (0.0, 0.0, math.sin(0.5 * heading), math.cos(0.5 * heading))
-            p.resetBasePositionAndOrientation(body, (x, y, z + half), turn, self._client)
+        self._led[kind] = {
+            body: [
+                ((x, y, z + half), (0.0, 0.0, math.sin(0.5 * heading), math.cos(0.5 * heading)))
+                for x, y, heading in way
+            ]
+            for body, way, z in zip(bodies, ways.values(), z_m, strict=True)
+        }
+
+    def _park(self, body: int) -> None:
+        p.resetBasePositionAndOrientation(body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT, self._client)
 
     def _taken(self, pool: Any) -> int:
         waiting = self._pools.setdefault(pool, [])
@@ -193,50 +223,74 @@ class Bodies:
         self._do("resetBaseVelocity", self._robot, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
         for wheel in self._wheels:
             self._do("resetJointState", self._robot, wheel, 0.0, 0.0)
+        self._read()
 
-    def turn_wheels(self, speeds_radps: Sequence[float]) -> None:
-        """Let the motors turn the drive's joints, in the order of `Skid.joints`, until told otherwise."""
-        p.setJointMotorControlArray(
-            self._robot,
-            self._wheels,
-            p.VELOCITY_CONTROL,
-            targetVelocities=speeds_radps,
-            forces=self._torques,
-            physicsClientId=self._client,
-        )
+    def step(self, substep: int, speeds_radps: list[float]) -> tuple[float, float, float]:
+        """One substep of a tick, from 0; x, y, heading of the robot's base frame after it.
 
-    def step(self) -> None:
+        speeds_radps: at which the motors turn the drive's joints, in the order of `Skid.joints`.
+        """
+        for led in self._led.values():
+            for body, way in led.items():
+                p.resetBasePositionAndOrientation(body, *way[substep], self._client)
+        if speeds_radps != self._asked_radps:  # the motors keep what they were asked for
+            self._asked_radps = speeds_radps
+            p.setJointMotorControlArray(
+                self._robot,
+                self._wheels,
+                p.VELOCITY_CONTROL,
+                targetVelocities=speeds_radps,
+                forces=self._torques,
+                physicsClientId=self._client,
+            )
         p.stepSimulation(self._client)
+        return self._read()
 
-    def yaw_rate(self) -> float:
-        """Rate of turn about the vertical, rad/s."""
-        rate: float = p.getBaseVelocity(self._robot, self._client)[1][2]
-        return rate
-
-    def robot_pose(self) -> tuple[float, float, float]:
-        """x, y, heading of the base frame."""
-        (x, y, _), m = self._frame()
+    def _read(self) -> tuple[float, float, float]:
+        """Ask the engine where the robot is, and how it moves."""
+        self._velocity = p.getBaseVelocity(self._robot, self._client)
+        (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
+        self._turned = m = p.getMatrixFromQuaternion(turn)
+        h = self._com_height_m  # the engine reports the centre of mass
+        self.at_m = x, y, _ = x - h * m[2], y - h * m[5], z - h * m[8]
+        self.yaw_rate_radps = self._velocity[1][2]
         return x, y, math.atan2(m[3], m[0])
 
     def robot_state(self) -> RobotState:
-        (x, y, z), m = self._frame()
-        linear, angular = p.getBaseVelocity(self._robot, self._client)
+        (x, y, z), m, (linear, angular) = self.at_m, self._turned, self._velocity
         forward = linear[0] * m[0] + linear[1] * m[3] + linear[2] * m[6]
         turn = angular[0] * m[2] + angular[1] * m[5] + angular[2] * m[8]
         pose = Pose(x, y, math.atan2(m[3], m[0]))
         return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
 
-    def _frame(self) -> tuple[tuple[float, float, float], tuple[float, ...]]:
-        """Position of the base frame, and its rotation row by row. The engine reports the centre of mass."""
-        (x, y, z), turn = p.getBasePositionAndOrientation(self._robot, self._client)
-        m: tuple[float, ...] = p.getMatrixFromQuaternion(turn)
-        h = self._com_height_m
-        return (x - h * m[2], y - h * m[5], z - h * m[8]), m
+    def watch(self, reach_m: float) -> None:
+        """Ask for contacts with what is led and what stands within a reach of the robot, and with nothing else."""
+        x, y, z = self.at_m
+        if math.dist(self.at_m, self._looked_from) > _AROUND_M:
+            far_m = reach_m + _AROUND_M
+            found = p.getOverlappingObjects(
+                (x - far_m, y - far_m, z - far_m), (x + far_m, y + far_m, z + far_m), self._client
+            )
+            standing = {
+                body for body, _ in found or () if body in self._what and self._what[body][0] in ("wall", "object")
+            }
+            self._around = {body: p.getAABB(body, -1, self._client) for body in sorted(standing)}
+            self._looked_from = self.at_m
+        self.watched = [
+            body
+            for body, ((x0, y0, _), (x1, y1, _)) in self._around.items()
+            if x0 - reach_m <= x <= x1 + reach_m and y0 - reach_m <= y <= y1 + reach_m
+        ]
+        for led in self._led.values():
+            self.watched += led
 
-    def robot_contacts(self) -> set[tuple[BodyKind, str]]:
-        """Everything but the ground that the robot touches now."""
-        points = p.getContactPoints(bodyA=self._robot, physicsClientId=self._client)
-        return {self._what[c[2]] for c in points if c[2] in self._what and c[8] <= 0.0}
+    def robot_contacts(self) -> list[tuple[BodyKind, str]]:
+        """What of the watched the robot touches now."""
+        return [
+            self._what[body]
+            for body in self.watched
+            if any(c[8] <= 0.0 for c in p.getContactPoints(self._robot, body, physicsClientId=self._client))
+        ]
 
     def _do(self, call: str, *args: Any, **options: Any) -> Any:
         try:

@@ -24,6 +24,7 @@ class SkidDrive:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
+        self._still = [0.0] * len(robot.drive.joints)
         self.reset()
 
     def reset(self) -> None:
@@ -40,7 +41,7 @@ class SkidDrive:
         self._w_radps = _towards(self._w_radps, command.w_radps, robot.acceleration_radps2 * dt_s)
         if self._v_mps == 0.0 and self._w_radps == 0.0:
             self._extra_radps = 0.0
-            return [0.0] * len(skid.joints)
+            return self._still
         error = self._w_radps - w_radps
         extra = self._extra_radps + _INTEGRAL_HZ * error * dt_s
         self._extra_radps = min(max(extra, -_EXTRA_MAX_RADPS), _EXTRA_MAX_RADPS)

@@ -1,59 +1,78 @@
-"""Where people and vehicles are between two snapshots of the street."""
+"""Where people and vehicles near the robot are between two snapshots of the street."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+import math
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.state import People, Vehicles
+from cosim.core.geometry import Pose
+from cosim.core.state import PERSON_RADIUS_M, People, Vehicles
 
 _JUMP_M: Final = 5.0
 """A longer way within one tick is a jump: the thing is at its new place at once."""
+_ROUNDING_M: Final = 0.01
+TickPoses = list[tuple[float, float, float]]
+_PERSON_SIZE_M: Final = (2.0 * PERSON_RADIUS_M, 2.0 * PERSON_RADIUS_M)
 
 
-@dataclass(frozen=True, slots=True)
-class Movers:
-    """Things that move evenly during a tick. start, change: (N, 3) x, y, heading, and what is added until its end."""
+class Mover(NamedTuple):
+    """Somebody or something that moves evenly during a tick. size_m: length and width; change: of x, y and heading from
+    the start of the tick to its end."""
 
-    ids: tuple[str, ...]
-    start: Floats
-    change: Floats
+    id: str
+    size_m: tuple[float, float]
+    start: Pose
+    change: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
-    @classmethod
-    def between(cls, before: People | Vehicles, after: People | Vehicles) -> Movers:
-        """What `after` holds; a thing that `before` lacks is at its new place at once."""
-        end = np.column_stack([after.xy, after.heading])
-        start = end.copy()
-        if before.ids == after.ids:
-            start[:, :2], start[:, 2] = before.xy, before.heading
-        else:
-            row = {name: i for i, name in enumerate(before.ids)}
-            pairs = [(i, row[name]) for i, name in enumerate(after.ids) if name in row]
-            for i, j in pairs:
-                start[i] = *before.xy[j], before.heading[j]
-        change = end - start
-        change[:, 2] = wrap_angles(change[:, 2])
-        jumped = np.hypot(change[:, 0], change[:, 1]) > _JUMP_M
-        start[jumped], change[jumped] = end[jumped], 0.0
-        return cls(after.ids, start, change)
+    def passes(self, x_m: float, y_m: float, reach_m: float) -> bool:
+        """Whether any part of it may come within `reach_m` of a point, somewhere on its way."""
+        way_m = math.hypot(*self.change[:2]) + 0.5 * math.hypot(*self.size_m)
+        return math.hypot(self.start.x_m - x_m, self.start.y_m - y_m) <= way_m + reach_m
 
-    def near(self, x_m: float, y_m: float, reach_m: Floats | float) -> Movers:
-        """Those that come within `reach_m` (one, or (N,)) of a point, at the start or at the end."""
-        offset = self.start[:, :2] - (x_m, y_m)
-        later = offset + self.change[:, :2]
-        gap = np.minimum(np.hypot(offset[:, 0], offset[:, 1]), np.hypot(later[:, 0], later[:, 1]))
-        return self.only(np.flatnonzero(gap <= reach_m))
+    def way(self, substeps: int) -> TickPoses:
+        """x, y, heading after each substep."""
+        (x, y, heading), (dx, dy, turn) = self.start, self.change
+        shares = [(k + 1) / substeps for k in range(substeps)]
+        return [(x + share * dx, y + share * dy, heading + share * turn) for share in shares]
 
-    def only(self, rows: np.ndarray[tuple[int], np.dtype[np.intp]]) -> Movers:
-        return Movers(tuple(self.ids[i] for i in rows), self.start[rows], self.change[rows])
 
-    def poses(self, substeps: int) -> Floats:
-        """(S, N, 3) x, y, heading after each substep."""
-        share = (np.arange(1, substeps + 1) / substeps)[:, None, None]
-        return self.start + share * self.change
+def movers_near(
+    before: People | Vehicles, after: People | Vehicles, x_m: float, y_m: float, reach_m: float
+) -> list[Mover]:
+    """What of `after` comes within `reach_m` of a point, at the start or at the end; a thing that `before` lacks is at
+    its new place at once."""
+    away, same = np.hypot(after.xy[:, 0] - x_m, after.xy[:, 1] - y_m), before.ids == after.ids
+    if same:
+        away = np.minimum(away, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
+    found = []
+    for i in np.flatnonzero(away <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).tolist():
+        name, was = after.ids[i], None
+        if same:
+            was = _pose(before, i)
+        elif name in before.ids:
+            was = _pose(before, before.ids.index(name))
+        size_m = _PERSON_SIZE_M
+        if isinstance(after, Vehicles):
+            size_m = float(after.size[i, 0]), float(after.size[i, 1])
+        mover = _moving(name, size_m, was, _pose(after, i))
+        from_x, from_y = mover.start.x_m - x_m, mover.start.y_m - y_m
+        if (
+            math.hypot(from_x, from_y) <= reach_m
+            or math.hypot(from_x + mover.change[0], from_y + mover.change[1]) <= reach_m
+        ):
+            found.append(mover)
+    return found
 
-    def __len__(self) -> int:
-        return len(self.ids)
+
+def _moving(name: str, size_m: tuple[float, float], was: Pose | None, end: Pose) -> Mover:
+    if was is None or math.dist(was[:2], end[:2]) > _JUMP_M:
+        return Mover(name, size_m, end)
+    turn = math.pi - (math.pi - (end.heading_rad - was.heading_rad)) % (2.0 * math.pi)
+    return Mover(name, size_m, was, (end.x_m - was.x_m, end.y_m - was.y_m, turn))
+
+
+def _pose(things: People | Vehicles, row: int) -> Pose:
+    x, y = things.xy[row].tolist()
+    return Pose(x, y, float(things.heading[row]))

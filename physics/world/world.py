@@ -6,7 +6,8 @@ vehicles within reach. Pictures are drawn elsewhere (physics.cameras.bullet_came
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import Final, Self
 
@@ -17,17 +18,22 @@ from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, write_protected
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier
-from physics.world.bodies import Bodies
+from physics.world.bodies import Bodies, Moving
 from physics.world.drive import SkidDrive
-from physics.world.movers import Movers
+from physics.world.movers import Mover, TickPoses, movers_near
 from physics.world.surface import Surface
-from physics.world.tiles import Key, distance_to, keys_within
+from physics.world.tiles import Key, distance_to, distances_within, keys_within
 
 SUBSTEP_S: Final = 0.005
 PEOPLE_REACH_M: Final = 6.0
 _VEHICLE_REACH_M: Final = 10.0
 _LOAD_M: Final = 20.0
 _UNLOAD_M: Final = 40.0
+_STRAY_M: Final = 0.2
+"""Who can be touched is found anew when the robot comes so far within a tick, as when something throws it."""
+_CLEAR_M: Final = 0.5
+"""Who can be touched is who a robot would touch that were larger by this: more than it strays before that is seen."""
+_ROUNDING_M: Final = 1e-6
 
 
 class BulletWorld:
@@ -48,6 +54,8 @@ class BulletWorld:
         self._drive = SkidDrive(robot)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
+        self._streamed, self._settled_m = (0.0, 0.0), 0.0
+        self._reach_m = math.hypot(0.5 * robot.length_m, 0.5 * robot.width_m, robot.height_m) + _CLEAR_M
 
     @property
     def footprint_m(self) -> tuple[float, float]:
@@ -74,6 +82,7 @@ class BulletWorld:
             self._bodies.close()
             self._bodies = None
             self._tiles.clear()
+            self._settled_m = 0.0
 
     def place(self, pose: Pose) -> RobotState:
         """Put the robot at rest at a pose, its wheels on the ground."""
@@ -87,63 +96,81 @@ class BulletWorld:
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
         """One tick of physics; people and vehicles move evenly from `before` to `after`."""
         bodies = self._engine
-        state = bodies.robot_state()
-        x, y = state.pose.x_m, state.pose.y_m
+        x, y, _ = pose = bodies.at_m
         self._stream(x, y)
-        people = Movers.between(before.people, after.people).near(x, y, PEOPLE_REACH_M)
-        half = 0.5 * after.vehicles.size
-        cars_all = Movers.between(before.vehicles, after.vehicles)
-        cars = cars_all.near(x, y, _VEHICLE_REACH_M)
-        row = {name: i for i, name in enumerate(after.vehicles.ids)}
-        car_half = half[[row[name] for name in cars.ids]] if len(cars) else np.zeros((0, 2))
-
-        people_poses, car_poses = people.poses(substeps), cars.poses(substeps)
-        people_z = self.surface.heights(people_poses[-1, :, :2]) if len(people) else np.zeros(0)
-        bodies.show("pedestrian", people.ids, people_z)
-        cars_z = self.surface.road(car_poses[-1, :, :2], car_poses[-1, :, 2], 2.0 * car_half)[:, 0]
-        bodies.show("vehicle", cars.ids, cars_z, 2.0 * car_half)
-
-        trace = np.empty((substeps, 3))
-        found: list[Contact] = []
+        near: dict[Moving, list[Mover]] = {
+            "pedestrian": movers_near(before.people, after.people, x, y, PEOPLE_REACH_M),
+            "vehicle": movers_near(before.vehicles, after.vehicles, x, y, _VEHICLE_REACH_M),
+        }
+        for kind, movers in near.items():
+            bodies.show(kind, movers)
+        close: dict[Moving, dict[Mover, TickPoses]] = {kind: {} for kind in near}
+        self._lead(near, close, x, y, substeps)
+        trace: list[tuple[float, float, float]] = []
+        found: set[Contact] = set()
         for k in range(substeps):
-            bodies.move("pedestrian", people_poses[k])
-            bodies.move("vehicle", car_poses[k])
-            bodies.turn_wheels(self._drive.joint_speeds(command, bodies.yaw_rate(), SUBSTEP_S))
-            bodies.step()
-            trace[k] = bodies.robot_pose()
-            found += [Contact(kind, other, k) for kind, other in bodies.robot_contacts()]
-        found += self._overlaps(trace, people.ids, people_poses, cars.ids, car_poses, car_half)
-        contacts = tuple(sorted(set(found), key=lambda c: (c.substep, c.kind, c.other)))
-        return Motion(bodies.robot_state(), write_protected(trace), contacts)
+            if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
+                x, y, _ = pose
+                self._lead(near, close, x, y, substeps)
+            pose = bodies.step(k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S))
+            trace.append(pose)
+            if bodies.watched:
+                found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
+        poses = write_protected(trace)
+        for kind, ways in close.items():
+            if ways:
+                found.update(self._overlaps(kind, ways, poses))
+        contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other)))
+        return Motion(bodies.robot_state(), poses, contacts)
 
-    def _overlaps(
+    def _lead(
         self,
-        trace: Floats,
-        people: tuple[str, ...],
-        people_poses: Floats,
-        cars: tuple[str, ...],
-        car_poses: Floats,
-        car_half: Floats,
-    ) -> list[Contact]:
-        """Overlaps of the footprint with disks and boxes, whatever the engine made of them."""
-        half = 0.5 * np.array(self.footprint_m)
-        found = []
-        if people:
-            gap = box_disk_gap(trace, half[0], half[1], people_poses[:, :, :2])
-            found += [Contact("pedestrian", people[i], int(k)) for k, i in np.argwhere(gap < PERSON_RADIUS_M)]
-        if cars:
-            hit = boxes_overlap(trace[:, None], half, car_poses, car_half[None])
-            found += [Contact("vehicle", cars[i], int(k)) for k, i in np.argwhere(hit)]
-        return found
+        near: Mapping[Moving, Sequence[Mover]],
+        close: Mapping[Moving, dict[Mover, TickPoses]],
+        x_m: float,
+        y_m: float,
+        substeps: int,
+    ) -> None:
+        """Let those move in the engine whom the robot could touch while it is within _STRAY_M of a point, and add them
+        to `close` with their ways; watch them, and what stands there."""
+        for kind, movers in near.items():
+            ways = {mover: mover.way(substeps) for mover in movers if mover.passes(x_m, y_m, self._reach_m)}
+            self._engine.lead(kind, ways, self._feet(kind, ways) if ways else [])
+            close[kind].update(ways)
+        self._engine.watch(self._reach_m)
+
+    def _feet(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
+        """Height of the ground under each at the end of the tick."""
+        end = np.array([way[-1] for way in ways.values()])
+        if kind == "pedestrian":
+            z_m = self.surface.heights(end[:, :2])
+        else:
+            z_m = self.surface.road(end[:, :2], end[:, 2], [mover.size_m for mover in ways])[:, 0]
+        return list(map(float, z_m))
+
+    def _overlaps(self, kind: Moving, ways: Mapping[Mover, TickPoses], trace: Floats) -> list[Contact]:
+        """Overlaps of the footprint with disks or boxes, whatever the engine made of them."""
+        half, poses = 0.5 * np.array(self.footprint_m), np.array(list(ways.values())).swapaxes(0, 1)
+        if kind == "pedestrian":
+            hit = box_disk_gap(trace, half[0], half[1], poses[:, :, :2]) < PERSON_RADIUS_M
+        else:
+            hit = boxes_overlap(trace[:, None], half, poses, 0.5 * np.array([[mover.size_m for mover in ways]]))
+        names = [mover.id for mover in ways]
+        return [Contact(kind, names[i], k) for k, i in np.argwhere(hit).tolist()]
 
     def _stream(self, x_m: float, y_m: float) -> None:
-        """Load the tiles around a point and drop those left behind."""
+        """Load the tiles around a point and drop those left behind; nothing to do before it has moved far enough."""
+        if math.hypot(x_m - self._streamed[0], y_m - self._streamed[1]) < self._settled_m:
+            return
         bodies = self._engine
         for key in [k for k in self._tiles if distance_to(k, x_m, y_m) > _UNLOAD_M]:
             bodies.remove(self._tiles.pop(key))
         for key in keys_within(x_m, y_m, _LOAD_M):
             if key not in self._tiles:
                 self._tiles[key] = bodies.add_chunk(self.surface.chunk(key))
+        ahead = [far_m - _LOAD_M for far_m, key in distances_within(x_m, y_m, _UNLOAD_M) if key not in self._tiles]
+        left = [_UNLOAD_M - distance_to(key, x_m, y_m) for key in self._tiles]
+        self._streamed, self._settled_m = (x_m, y_m), min(ahead + left) - _ROUNDING_M
 
     @property
     def _engine(self) -> Bodies:

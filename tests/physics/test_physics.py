@@ -17,6 +17,7 @@ from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import Barrier
 from physics.cameras.bullet_camera import BulletCamera
 from physics.robots import urdf_of
+from physics.world.bullet import p
 from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from tests.tiny_street import tiny_map
@@ -124,6 +125,30 @@ def test_a_walking_person_is_met_within_the_tick(world: BulletWorld) -> None:
     substeps = [c.substep for c in motion.contacts if c.other == "c1"]
     assert substeps and substeps[0] == 1
     assert 9 not in substeps
+
+
+@pytest.mark.engine
+def test_who_cannot_be_touched_changes_nothing() -> None:
+    """With people and a vehicle some two metres beside its way the robot goes, to the bit, as in an empty street."""
+    crowd = People.of(("c1", "c2"), [[-18.0, 7.2], [-16.0, 2.8]], [0.0, 1.0], [0.0, 0.0], ("stand", "stand"))
+    cars = Vehicles.of(("v1",), [[-17.0, -1.0]], [0.0], [0.0], [[4.5, 1.8]])
+    ways = []
+    for street in (EMPTY, Street(0, people=crowd, vehicles=cars)):
+        with BulletWorld(StreetSurface(MAP, seed=1)) as world:
+            world.place(Pose(-20.0, 5.0, 0.0))
+            ways.append(b"".join(motion.trace.tobytes() for motion in drive(world, 1.0, 0.1, 60, street)))
+    assert ways[0] == ways[1]
+
+
+@pytest.mark.engine
+def test_a_robot_that_is_thrown_meets_who_stands_there(world: BulletWorld) -> None:
+    """Somebody who was out of its reach when the tick began stops it within the tick, and is named."""
+    world.place(Pose(-20.0, 5.0, 0.0))
+    drive(world, 0.0, 0.0, 5)
+    p.resetBaseVelocity(world._engine._robot, (40.0, 0.0, 0.0), (0.0, 0.0, 0.0), world._engine._client)
+    motion = world.step(Command(0.0, 0.0), person(-18.3, 5.0), person(-18.3, 5.0), 10)
+    assert {(c.kind, c.other) for c in motion.contacts} == {("pedestrian", "c1")}
+    assert motion.robot.v_mps < 10.0
 
 
 @pytest.mark.engine
