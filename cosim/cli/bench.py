@@ -78,9 +78,10 @@ def _taken(
     what: str, only: Sequence[str], checkouts: Sequence[Path | None], rounds: int
 ) -> list[dict[str, list[Figure]]]:
     """The figures of checkouts, None for this one, each value of each round."""
-    from scenarios.bench.measurements import CAMERA, ENVIRONMENT, ROOT, chosen, take_rounds
+    from scenarios.bench.measurements import CAMERA, ENVIRONMENT, ON_REQUEST, ROOT, chosen, take_rounds
 
-    names = chosen(only, tuple(CAMERA) if what == "camera" else ENVIRONMENT)
+    environment = (*ENVIRONMENT, *ON_REQUEST) if only else ENVIRONMENT
+    names = chosen(only, tuple(CAMERA) if what == "camera" else environment)
     with doing("measuring") as tell:
         return take_rounds(names, [one or ROOT for one in checkouts], rounds, lambda words: tell(f"measuring: {words}"))
 

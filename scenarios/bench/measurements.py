@@ -15,12 +15,14 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import EngineError, UsageError, unknown
-from scenarios.bench import cameras, driving, episodes, places, starting, street
+from scenarios.bench import cameras, driving, episodes, places, starting, street, together
 from scenarios.bench.figures import MORE, Figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ENVIRONMENT: Final = ("driving", "large pictures", "towns", "starting", "street 50", "street 150", "places", "reactive")
 """Taken by `cosim bench`."""
+ON_REQUEST: Final = ("ten environments",)
+"""Taken by `cosim bench` when they are named: they are for a machine of many cores."""
 _ENGINES: Final = "engines"
 
 
@@ -41,6 +43,7 @@ _TAKEN: Final[Mapping[str, Callable[[], list[Figure]]]] = {
     "street 150": partial(street.walking, 150),
     "places": places.places,
     "reactive": episodes.reactive,
+    "ten environments": together.driving_together,
     **CAMERA,
 }
 

@@ -1,0 +1,117 @@
+"""How fast many environments drive together, drawn for by one renderer that asks one policy for all of them."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from cosim.core.errors import EngineError
+from cosim.core.state import Command
+from cosim.episode.ports import Observation
+from cosim.policies.route import Route
+from scenarios.bench.driving import FourHertz
+from scenarios.bench.figures import MORE, Figure
+
+ENVIRONMENTS: Final = 10
+_WARM_UP_S: Final = 5.0
+_MEASURED_S: Final = 30.0
+"""Simulated seconds of each environment, on average, that the figure is taken from."""
+
+
+class RoutesTogether(FourHertz):
+    """The route policy for many episodes at once, with the pictures in one array, as a model would want them."""
+
+    def __init__(self) -> None:
+        self._routes: dict[str, Route] = {}
+
+    def reset(self, scenario_id: str, seed: int) -> None:
+        self._routes[scenario_id] = route = Route()
+        route.reset(scenario_id, seed)
+
+    def act(self, observation: Observation) -> Command:
+        return self.act_batch([observation])[0]
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
+        np.stack([one.rgb for one in observations if one.rgb is not None])
+        return [self._routes[one.episode].act(one) for one in observations]
+
+
+def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -> list[Figure]:
+    """Simulated seconds a second, of all environments in all, once each has warmed up: long-horizon, 96x96 at 4 Hz.
+
+    shared: by one renderer and one policy for all of them; else each environment has its own of both."""
+    from cosim.policies.load import load_policy
+    from cosim.records.run_folder import RunFolder
+    from cosim.spec.options import EpisodeOptions
+    from cosim.spec.scenario import Suite
+    from scenarios.catalog import load_suite
+    from scenarios.execution.messages import Hello
+    from scenarios.execution.pool import run_all
+    from scenarios.execution.process import LocalProcesses
+    from scenarios.execution.suite_run import run_spec
+    from scenarios.rendering.shared import SharedRenderer
+
+    shipped = load_suite("long-horizon").scenarios
+    picked = [
+        msgspec.structs.replace(shipped[i % len(shipped)], id=f"together-{i}", seed=i) for i in range(environments)
+    ]
+    suite = Suite(name="together", version="1", scenarios=tuple(picked))
+    name = f"{__name__}:{RoutesTogether.__name__}"
+    driver, options = load_policy(name), EpisodeOptions(camera="gl")
+    hello, watch = Hello(name, driver.manifest, driver.source_hash), _Watch(environments)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+        spec = run_spec(suite, picked, name, driver, options, shared)
+        held = stack.enter_context(RunFolder.create(folder, spec, suite))
+        logs = held.path / "logs"
+        renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True)) if shared else None
+        with suppress(_Enough):
+            processes = LocalProcesses(logs)
+            run_all(
+                held, picked, hello, processes, jobs=environments, tell=watch.hear, options=options, renderer=renderer
+            )
+    how = "shared renderer and batched policy" if shared else "each with its own renderer and policy"
+    rate, reach = watch.rate(), 60.0 if shared and environments == ENVIRONMENTS else None
+    return [Figure(f"{environments} environments, {how}, simulated s per s in all", rate, reach=reach, better=MORE)]
+
+
+class _Enough(Exception):
+    """The figure can be taken."""
+
+
+class _Watch:
+    """Hears how far every environment is."""
+
+    def __init__(self, environments: int) -> None:
+        self._environments = environments
+        self._at_s: dict[str, float] = {}
+        self._began: tuple[float, float] | None = None
+        self._ended: tuple[float, float] | None = None
+
+    def hear(self, message: object) -> None:
+        """Raises _Enough at the end of the time to measure."""
+        from scenarios.execution.messages import Progress
+
+        if not isinstance(message, Progress):
+            return
+        self._at_s[message.scenario] = message.time_s
+        so_far = time.perf_counter(), sum(self._at_s.values())
+        if self._began is None:
+            if len(self._at_s) == self._environments and min(self._at_s.values()) >= _WARM_UP_S:
+                self._began = so_far
+        elif so_far[1] - self._began[1] >= _MEASURED_S * self._environments:
+            self._ended = so_far
+            raise _Enough
+
+    def rate(self) -> float:
+        """Simulated seconds a second. Raises EngineError when the environments ended before it could be taken."""
+        if self._began is None or self._ended is None:
+            raise EngineError("the environments ended before their speed could be taken: they crashed")
+        return (self._ended[1] - self._began[1]) / (self._ended[0] - self._began[0])
