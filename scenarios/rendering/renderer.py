@@ -1,9 +1,10 @@
 """The shared renderer: one process that draws for all environments of a run and, where the policy answers for many
 episodes at once, asks it.
 
-Environments connect, and ask for one thing at a time (`scenarios.rendering.exchange`). What waits is answered together
-as soon as every environment that runs a scenario waits, or after a moment. A picture is a function of robot and street
-alone, and each environment goes on when it has its own reply: who was drawn together changes nothing.
+Environments connect, and ask for one thing at a time (`scenarios.rendering.exchange`). All pictures that are waited for
+are drawn together, at once: the busier the renderer, the more they are. Who has just got one asks the policy next; for
+those a moment is waited, so that it is asked for all of them. A picture is a function of robot and street alone, and
+each environment goes on when it has its own reply: who was drawn or asked together changes nothing.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ if TYPE_CHECKING:
     from physics.cameras.gl.atlas import Atlas, SeatKey
 
 _WINDOW_S: Final = 0.002
-"""What waits is answered after this time, whoever does not wait yet."""
+"""So long the policy is not asked for those who wait for it, while others are about to."""
 _BEAT_S: Final = 1.0
 _PLACES_KEPT: Final = 8
 _PEER: Final = struct.Struct("3i")
@@ -92,13 +93,15 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
 
 class _Environment:
     """An environment process that has connected. scenario: which it runs, None for none; seat: its place in the atlas;
-    wants: what it waits for; free: where its robot may be."""
+    wants: what it waits for; asks_next: it has a picture that the policy was not asked about; free: where its robot may
+    be."""
 
     def __init__(self, end: socket.socket, size: tuple[int, int]) -> None:
         self.wire, self.memory = Wire(end), PictureMemory.new(size)
         self.scenario: Scenario | None = None
         self.seat: SeatKey | None = None
         self.wants: Draw | Begin | Ask | None = None
+        self.asks_next = False
         self.free: Polygon | MultiPolygon = MultiPolygon()
         socket.send_fds(end, [b"\0"], [self.memory.descriptor])
 
@@ -143,11 +146,13 @@ class _Renderer:
                 self._answer()
 
     def _left_s(self) -> float:
-        """How long may be waited for what else is asked; 0 when everybody waits who runs a scenario."""
-        running = [one for one in self._environments if one.scenario is not None]
-        if not any(one.wants for one in running):
+        """How long may be waited for what else is asked."""
+        wanted = [one.wants for one in self._environments if one.wants is not None]
+        if not wanted:
             return _BEAT_S
-        return 0.0 if all(one.wants for one in running) else self._since_s + _WINDOW_S - time.monotonic()
+        if all(isinstance(wants, Ask) for wants in wanted) and any(one.asks_next for one in self._environments):
+            return self._since_s + _WINDOW_S - time.monotonic()
+        return 0.0
 
     def _ended(self) -> None:
         """The run has gone: it says nothing after its first message."""
@@ -193,9 +198,9 @@ class _Renderer:
         else:
             if isinstance(request, Ask) and request.known is not None and request.known.free:
                 one.free = _ground(request.known.free)
-            if not any(other.wants for other in self._environments):
+            if not any(isinstance(other.wants, Ask) for other in self._environments):
                 self._since_s = time.monotonic()
-            one.wants = request
+            one.wants, one.asks_next = request, False
         return True
 
     def _entered(self, one: _Environment, scenario: Scenario) -> Reply:
@@ -212,15 +217,18 @@ class _Renderer:
         if one.seat is not None and self._atlas is not None:
             self._atlas.leave(one.seat)
         one.scenario = one.seat = one.wants = None
+        one.asks_next = False
 
     def _answer(self) -> None:
-        """Answer all that waits."""
+        """Answer what waits: pictures and resets, and if none of these does, questions to the policy."""
         waiting = sorted((one for one in self._environments if one.wants is not None), key=lambda one: one.name)
+        asks = [one for one in waiting if isinstance(one.wants, Ask)]
+        if len(asks) == len(waiting):
+            self._act(asks)
         self._draw([one for one in waiting if isinstance(one.wants, Draw)])
         for one in waiting:
             if isinstance(one.wants, Begin):
                 self._begin(one)
-        self._act([one for one in waiting if isinstance(one.wants, Ask)])
 
     def _draw(self, which: list[_Environment]) -> None:
         """Draw for these, together. Where that cannot be, by halves: it may be the fault of one of them."""
@@ -241,6 +249,7 @@ class _Renderer:
             return
         for one, frame in zip(which, frames, strict=True):
             one.memory.put(frame)
+            one.asks_next = self._driver is not None
             one.reply(Fine())
 
     def _begin(self, one: _Environment) -> None:

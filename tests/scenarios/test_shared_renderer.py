@@ -86,18 +86,23 @@ def asked_together(renderer: SharedRenderer, links: Sequence[RendererLink], *req
     return [link._received() for link in links]
 
 
-def seen_by_itself(scenario: Scenario, robot: RobotState, streets: Sequence[Street]) -> list[Frame]:
-    """The pictures of a camera of its own."""
+def seen_by_themselves(
+    scenarios: Sequence[Scenario], robot: RobotState, streets: Sequence[Street]
+) -> list[list[Frame]]:
+    """The pictures of a camera of its own for each of some scenarios in one place."""
     from cosim.spec.robot import robot_called
     from physics.cameras.gl.camera import GlCamera
     from physics.world.street_surface import StreetSurface
     from physics.world.world import BulletWorld
 
     spec = Seeing.manifest.camera
-    surface = StreetSurface(place(scenario.place)[1], scenario.place.seed)
-    world = BulletWorld(surface, scenario.barriers, robot_called(scenario.robot))
-    with GlCamera(world, spec, light=scenario.light) as camera:
-        return [camera.render(robot, street) for street in streets]
+    where = scenarios[0].place
+    surface, found = StreetSurface(place(where)[1], where.seed), []
+    for scenario in scenarios:
+        world = BulletWorld(surface, scenario.barriers, robot_called(scenario.robot))
+        with GlCamera(world, spec, light=scenario.light) as camera:
+            found.append([camera.render(robot, street) for street in streets])
+    return found
 
 
 @pytest.mark.engine
@@ -108,7 +113,7 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
     (one,) = scenarios_of("one")
     other = msgspec.structs.replace(one, id="other", robot="scout", light=Light(hour=19.0))
     busy = busy_street(place(one.place)[1], persons=20, frames=4)
-    expected = [seen_by_itself(each, busy.robot, busy.streets) for each in (one, other)]
+    expected = seen_by_themselves((one, other), busy.robot, busy.streets)
     with renderer_for(tmp_path, Seeing()) as renderer:
         links = [linked(renderer) for _ in range(3)]
         for link, each in zip(links, (one, other, other), strict=True):
