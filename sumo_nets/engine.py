@@ -5,21 +5,42 @@ One SUMO per process: `start` and `close` are its life, `sumo` its functions mea
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
-import libsumo
+import sumo as eclipse_sumo  # noqa: F401  sets where SUMO finds its data
 
 from cosim.core.errors import EngineError
+
+
+@contextmanager
+def _unexecuted(package: str) -> Iterator[None]:
+    """Meanwhile modules of a package are imported without its `__init__`; who imports it afterwards gets all of it."""
+    found = importlib.util.find_spec(package)
+    if package in sys.modules or found is None or found.submodule_search_locations is None:
+        yield
+        return
+    sys.modules[package] = importlib.util.module_from_spec(found)
+    try:
+        yield
+    finally:
+        del sys.modules[package]
+
+
+with _unexecuted("libsumo"):  # which would import traci, sumolib and pyproj, none of them used here
+    import libsumo.libsumo as _sumo
+
+libsumo: Any = _sumo
+libsumo.simulationStep = libsumo.simulation.step
 
 _EYE: Final = "robot"
 _NOWHERE_M: Final = -1e8
 """Who has not set out yet is beyond this."""
-_tc: Final = libsumo.constants
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 
@@ -120,16 +141,16 @@ def start(arguments: list[str]) -> None:
     said: list[str] = []
     try:
         with _stderr_into(said):
-            libsumo.start(["sumo", *arguments])
+            libsumo.simulation.start(["sumo", *arguments])
     except _ERRORS as error:
         with suppress(*_ERRORS):
-            libsumo.close()
+            libsumo.simulation.close()
         raise EngineError(" ".join("".join([*said, str(error)]).split())) from error
 
 
 def close() -> None:
     """Stop SUMO."""
-    libsumo.close()
+    libsumo.simulation.close()
 
 
 @contextmanager
@@ -163,10 +184,10 @@ def open_eye(x_m: float, y_m: float, persons_m: float, vehicles_m: float) -> Non
     """From now on the persons and vehicles so near to a point are told, by one subscription each."""
     libsumo.poi.add(_EYE, x_m, y_m, (0, 0, 0, 0))
     for domain, reach_m, variable in (
-        (_tc.CMD_GET_PERSON_VARIABLE, persons_m, _tc.VAR_NEXT_EDGE),
-        (_tc.CMD_GET_VEHICLE_VARIABLE, vehicles_m, _tc.VAR_ANGLE),
+        (libsumo.CMD_GET_PERSON_VARIABLE, persons_m, libsumo.VAR_NEXT_EDGE),
+        (libsumo.CMD_GET_VEHICLE_VARIABLE, vehicles_m, libsumo.VAR_ANGLE),
     ):
-        libsumo.poi.subscribeContext(_EYE, domain, reach_m, [_tc.VAR_POSITION, _tc.VAR_SPEED, variable])
+        libsumo.poi.subscribeContext(_EYE, domain, reach_m, [libsumo.VAR_POSITION, libsumo.VAR_SPEED, variable])
 
 
 def move_eye(x_m: float, y_m: float) -> None:
@@ -178,13 +199,13 @@ def near_eye() -> tuple[dict[str, NearPerson], dict[str, NearVehicle]]:
     """Who has set out and is near the point, by name, in the order of the names."""
     persons, vehicles = {}, {}
     for name, row in sorted(libsumo.poi.getContextSubscriptionResults(_EYE).items()):
-        x_m, y_m = row[_tc.VAR_POSITION]
+        x_m, y_m = row[libsumo.VAR_POSITION]
         if x_m <= _NOWHERE_M:
             continue
-        if _tc.VAR_ANGLE in row:
-            vehicles[name] = NearVehicle(x_m, y_m, row[_tc.VAR_SPEED], row[_tc.VAR_ANGLE])
+        if libsumo.VAR_ANGLE in row:
+            vehicles[name] = NearVehicle(x_m, y_m, row[libsumo.VAR_SPEED], row[libsumo.VAR_ANGLE])
         else:
-            persons[name] = NearPerson(x_m, y_m, row[_tc.VAR_SPEED], row[_tc.VAR_NEXT_EDGE])
+            persons[name] = NearPerson(x_m, y_m, row[libsumo.VAR_SPEED], row[libsumo.VAR_NEXT_EDGE])
     return persons, vehicles
 
 

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.errors import MapError
@@ -65,6 +63,9 @@ def through_corner(street_map: StreetMap, leave: Port, enter: Port) -> Floats:
 
 def shortest_inside(area: Polygon | MultiPolygon, a: Floats, b: Floats) -> Floats | None:
     """The shortest line from a to b inside an area, (N, 2) metres, or None. By its visibility graph."""
+    from scipy.sparse import csr_array  # 0.2 s, and episodes have their lines
+    from scipy.sparse.csgraph import dijkstra
+
     grown = shapely.buffer(area, 0.01)
     shapely.prepare(grown)
     if not (shapely.contains_xy(grown, *a) and shapely.contains_xy(grown, *b)):

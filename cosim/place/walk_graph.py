@@ -10,16 +10,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra
 
 from cosim.core.errors import MapError
 from cosim.core.geometry import Floats
 from cosim.place.street_map import Port, StreetMap
+
+if TYPE_CHECKING:  # imported where it is used: a crowd that only wanders does without
+    from scipy.sparse import csr_array
 
 OPEN: frozenset[Port] = frozenset()
 """No port is closed."""
@@ -84,18 +86,22 @@ class WalkGraph:
             for corner in street_map.corners.values()
             for port in corner.ports
         }
-        self._hops = self._corner_arcs()
-        lengths = np.array([max(strip.length_m, SHORTEST_HOP_M) for strip in strips])
-        even = 2 * np.arange(len(strips), dtype=np.int32)
-        self._along = (np.concatenate([even, even + 1]), np.concatenate([even + 1, even]), np.tile(lengths, 2))
         self._arcs = lru_cache(maxsize=8)(self._arcs_without)
-        _, labels = connected_components(self._arcs(OPEN), directed=False)
-        self.component: NDArray[np.int32] = labels
-        totals = np.bincount(labels[::2], weights=lengths) if strips else np.zeros(1)
-        main = int(np.argmax(totals))
-        self.main_strips: frozenset[str] = frozenset(
-            s.id for s, c in zip(strips, labels[::2], strict=True) if c == main
-        )
+
+    @cached_property
+    def component(self) -> NDArray[np.int32]:
+        from scipy.sparse.csgraph import connected_components
+
+        labels: NDArray[np.int32] = connected_components(self._arcs(OPEN), directed=False)[1]
+        return labels
+
+    @cached_property
+    def main_strips(self) -> frozenset[str]:
+        if not self.street_map.strips:
+            return frozenset()
+        labels, (_, _, lengths_m) = self.component[::2], self._along
+        main = np.argmax(np.bincount(labels, weights=lengths_m[: len(labels)]))
+        return frozenset(strip for strip, c in zip(self.street_map.strips, labels, strict=True) if c == main)
 
     def point(self, port: Port) -> tuple[float, float]:
         """Where a port is, in metres."""
@@ -117,6 +123,8 @@ class WalkGraph:
 
     def reach(self, start: Port, closed: frozenset[Port] = OPEN, limit_m: float = math.inf) -> Reach:
         """Distances from `start` to every port within `limit_m`."""
+        from scipy.sparse.csgraph import dijkstra
+
         distance, before = dijkstra(  # type: ignore[call-overload]
             self._arcs(closed), indices=_number(self._index, start), return_predecessors=True, limit=limit_m
         )
@@ -151,7 +159,14 @@ class WalkGraph:
             walk.pop()
         return walk
 
-    def _corner_arcs(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+    @cached_property
+    def _along(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
+        lengths = np.array([max(strip.length_m, SHORTEST_HOP_M) for strip in self.street_map.strips.values()])
+        even = 2 * np.arange(len(lengths), dtype=np.int32)
+        return np.concatenate([even, even + 1]), np.concatenate([even + 1, even]), np.tile(lengths, 2)
+
+    @cached_property
+    def _hops(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:
         pairs = [
             (_number(self._index, a), _number(self._index, b))
             for corner in self.street_map.corners.values()
@@ -164,6 +179,8 @@ class WalkGraph:
         return nodes[:, 0], nodes[:, 1], np.maximum(np.hypot(gap[:, 0], gap[:, 1]), SHORTEST_HOP_M)
 
     def _arcs_without(self, closed: frozenset[Port]) -> csr_array:
+        from scipy.sparse import csr_array
+
         tails, heads, metres = self._hops
         if closed:
             shut = self._numbers(closed)

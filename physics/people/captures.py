@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats
@@ -81,4 +80,6 @@ def _turn(rows: Floats, name: str) -> Floats:
     if name in _HINGES:
         return np.column_stack([np.zeros(len(rows)), -rows[:, at], np.zeros(len(rows))])
     w, x, y, z = rows[:, at : at + 4].T
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_quat(np.column_stack([x, -z, y, w])).as_rotvec()

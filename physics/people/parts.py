@@ -7,7 +7,6 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from cosim.core.geometry import Floats
 from cosim.core.state import People
@@ -158,6 +157,8 @@ def part_colours(name: str, age: int) -> tuple[Colour, ...]:
 
 def _quaternions(turns: Floats) -> Floats:
     """(..., 4) quaternions x, y, z, w of (..., 3, 3) matrices that are nearly rotations."""
+    from scipy.spatial.transform import Rotation
+
     x = turns[..., 0] / np.linalg.norm(turns[..., 0], axis=-1, keepdims=True)
     z = np.cross(x, turns[..., 1])
     z /= np.linalg.norm(z, axis=-1, keepdims=True)

@@ -14,7 +14,6 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 from cosim.core.geometry import Floats
 
@@ -52,12 +51,16 @@ class Skeleton:
 
 def rodrigues(turns_rad: ArrayLike) -> Floats:
     """(..., 3, 3) rotations about (..., 3) axis-angle vectors (paper: the exponential of a joint's axis-angle)."""
+    from scipy.spatial.transform import Rotation  # what is baked does without it
+
     turns = np.asarray(turns_rad, dtype=float)
     return Rotation.from_rotvec(turns.reshape(-1, 3)).as_matrix().reshape(*turns.shape, 3)
 
 
 def axis_angle(matrices: Floats) -> Floats:
     """(..., 3) axis-angle vectors of (..., 3, 3) rotations of less than half a turn."""
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_rotvec().reshape(matrices.shape[:-1])
 
 

@@ -8,7 +8,6 @@ from pathlib import Path
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City, Place
 from sumo_nets.city.store import city_net
-from sumo_nets.maps.mapstore import map_net, read_map
 from sumo_nets.net.snapshot import street_map_of
 
 
@@ -18,4 +17,6 @@ def place(where: Place) -> tuple[Path, StreetMap]:
     if isinstance(where, City):
         path = city_net(where)
         return path, street_map_of(path)
+    from sumo_nets.maps.mapstore import map_net, read_map  # with the importer of maps
+
     return map_net(where), read_map(where)

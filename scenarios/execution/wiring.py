@@ -33,7 +33,6 @@ from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place
 from scenarios.execution.scorer import Scorer
 from scenarios.rendering.link import SharedCamera
-from scenarios.residents.director import among_residents
 from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.demand_log import Entrances
 
@@ -93,7 +92,10 @@ def staged(
         elif manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
-        director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
+        if scenario.crowd.residents:
+            from scenarios.residents.director import among_residents  # with what draws their graph
+
+            director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = InjectedPeople(director, clock.tick_ms, partial(on_map, street_map), options.injections)
         footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
         free = shapely.buffer(footing, -robot.width_m / 2)

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cosim.core.state import Signal
 from cosim.place.street_map import StreetMap
@@ -35,7 +34,7 @@ class Signals:
                         self._link.setdefault(edge, (light, index))
         self._ids = sorted(self._link)
         middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
-        self._tree = cKDTree(np.array(middles, dtype=float).reshape(-1, 2))
+        self._xy = np.array(middles, dtype=float).reshape(-1, 2)
         self._phases: dict[str, tuple[tuple[float, str], ...] | None] = {}
         self._until: dict[str, float] = {}
         self._shown: dict[str, tuple[bool, float | None]] = {}
@@ -46,7 +45,8 @@ class Signals:
         """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
         if self._centre is None or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
             self._centre = (x_m, y_m)
-            self._near = [self._ids[i] for i in self._tree.query_ball_point((x_m, y_m), _NEAR_M, return_sorted=True)]
+            gap = self._xy - (x_m, y_m)
+            self._near = [self._ids[i] for i in np.flatnonzero((gap * gap).sum(axis=1) <= _NEAR_M * _NEAR_M)]
         now_s = self._engine.simulation.getTime()
         signals = {}
         for crossing in self._near:

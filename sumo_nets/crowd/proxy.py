@@ -8,13 +8,11 @@ the place changes. Other ways of moving a person (free mapping, a walk of one wa
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
 from typing import NamedTuple
 
-import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString
 
 from cosim.core.geometry import Pose, heading_to_sumo
@@ -249,13 +247,17 @@ def _line(engine: Sumo, edge: str) -> shapely.Geometry:
 
 def _meeting_places(street_map: StreetMap) -> dict[str, str]:
     """Corner or crossing id -> id of the first of the corners that it is joined with by crossings."""
-    corners = sorted(street_map.corners)
-    row = {corner: k for k, corner in enumerate(corners)}
     crossings = [strip for strip in street_map.strips.values() if strip.kind == "crossing" and any(strip.corners)]
-    joins = [[row[corner] for corner in crossing.corners if corner is not None] for crossing in crossings]
-    first, last = np.array([(join[0], join[-1]) for join in joins], dtype=int).reshape(-1, 2).T
-    joined = coo_array((np.ones(len(first)), (first, last)), shape=(len(corners), len(corners)))
-    _, parts = connected_components(joined, directed=False)
-    _, firsts = np.unique(parts, return_index=True)
-    place = {corner: corners[firsts[part]] for corner, part in zip(corners, parts, strict=True)}
-    return place | {crossing.id: place[corners[join[0]]] for crossing, join in zip(crossings, joins, strict=True)}
+    joined: dict[str, list[str]] = defaultdict(list)
+    for crossing in crossings:
+        ends = [corner for corner in crossing.corners if corner is not None]
+        joined[ends[0]].append(ends[-1])
+        joined[ends[-1]].append(ends[0])
+    place: dict[str, str] = {}
+    for first in sorted(street_map.corners):
+        reached = [first]
+        while reached:
+            if (corner := reached.pop()) not in place:
+                place[corner] = first
+                reached += joined[corner]
+    return place | {one.id: place[next(corner for corner in one.corners if corner is not None)] for one in crossings}

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats, Polyline, Pose
 
@@ -42,13 +41,12 @@ class Spots:
             poses.append(np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])]))
         self._shares = np.concatenate(shares)
         self._poses = np.concatenate(poses)
-        self._tree = cKDTree(self._poses[:, :2])
 
     def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[int]:
         """The numbers of the spots at a distance in [low_m, high_m)."""
-        hits = np.array(self._tree.query_ball_point((x_m, y_m), high_m, return_sorted=True), dtype=np.intp)
-        gap = self._poses[hits, :2] - (x_m, y_m)
-        near: list[int] = hits[np.hypot(gap[:, 0], gap[:, 1]) >= low_m].tolist()
+        gap = self._poses[:, :2] - (x_m, y_m)
+        inside = np.flatnonzero((gap * gap).sum(axis=1) <= high_m * high_m)
+        near: list[int] = inside[np.hypot(*gap[inside].T) >= low_m].tolist()
         return near
 
     def __getitem__(self, number: int) -> EntrySpot:

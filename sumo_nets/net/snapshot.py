@@ -28,7 +28,6 @@ import cosim
 import sumo_nets
 from cosim.core.baked import cache_folder
 from cosim.place.street_map import StreetMap
-from sumo_nets.net.netfile import read_net
 
 SNAPSHOT_FOLDER: Final = "read"
 _SEAL_BYTES: Final = 32
@@ -55,14 +54,20 @@ def street_map_of(path: Path) -> StreetMap:
     try:
         net = path.read_bytes()
     except OSError:
-        return read_net(path)
+        return _read(path)
     kept = cache_folder() / SNAPSHOT_FOLDER / f"{_key(path.name, net)}.map"
     with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
         return thawed(kept.read_bytes())
-    street_map = read_net(path)
+    street_map = _read(path)
     with suppress(OSError):
         _write(kept, map_as_bytes(street_map))
     return street_map
+
+
+def _read(path: Path) -> StreetMap:
+    from sumo_nets.net.netfile import read_net  # with all that reading takes: most nets were read before
+
+    return read_net(path)
 
 
 def map_as_bytes(street_map: StreetMap) -> bytes:

@@ -54,7 +54,7 @@ def test_the_second_reading_comes_from_the_snapshot(net: Path, cache: Path, monk
     """Once a snapshot lies there the net itself is not parsed again."""
     first = street_map_of(net)
     assert len(list(cache.iterdir())) == 1
-    monkeypatch.setattr("sumo_nets.net.snapshot.read_net", lambda _: pytest.fail("parsed again"))
+    monkeypatch.setattr("sumo_nets.net.netfile.read_net", lambda _: pytest.fail("parsed again"))
     assert map_as_bytes(street_map_of(net)) == map_as_bytes(first)
 
 
