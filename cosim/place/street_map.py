@@ -134,7 +134,7 @@ PieceKind = Literal["strip", "corner", "lane", "junction"]
 _Piece = Strip | Corner | Lane | Junction
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class StreetMap:
     """A place. All ids are SUMO edge, lane or junction ids; the mappings are in the net's order.
 

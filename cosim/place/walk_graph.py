@@ -195,6 +195,12 @@ class WalkGraph:
         return np.array([_number(self._index, port) for port in ports], dtype=np.int32)
 
 
+@lru_cache(maxsize=1)
+def walk_graph_of(street_map: StreetMap) -> WalkGraph:
+    """The graph of a place; the last one is kept."""
+    return WalkGraph(street_map)
+
+
 def _number(index: dict[str, int], port: Port) -> int:
     try:
         return index[port.strip] + port.end

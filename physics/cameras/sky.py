@@ -9,19 +9,22 @@ Radiance is linear sRGB; 1 is a white matt surface that faces the sun outside th
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import lru_cache
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.baked import baked, sources_hash
 from cosim.core.geometry import Floats
 from cosim.spec.scenario import Light
 from physics.cameras.clearsky import LUMINANCE, clear_sky
 from physics.cameras.clouds import clouded
 from physics.cameras.hdri import brightest, read_hdri
 from physics.cameras.sun import sun_direction, transmittance
+from physics.textures import noise
 
 HORIZON_FADE: Final = 0.06
 """The sine of the angle over which the horizon fades into the ground below it."""
@@ -44,6 +47,8 @@ _LAMPS: Final = 2.2e-4 * np.array([1.0, 0.82, 0.62])
 """Light of a lamp-lit street at night, some 28 lx."""
 _NIGHT: Final = 2.2e-4 * np.array([0.62, 0.72, 1.0])
 """Scale of the glow of a city's sky."""
+
+_MADE_BY: Final = sources_hash(Path(__file__).parent, Path(noise.__file__).parent)
 
 _Image = NDArray[np.float32]
 
@@ -72,10 +77,22 @@ class Sky:
         return math.asin(float(np.clip(self.sun[2], -1.0, 1.0)))
 
 
-@lru_cache(maxsize=8)
 def sky_of(light: Light, seed: int = 0) -> Sky:
     """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the user's."""
-    return _photographed(light) if light.hdri else _procedural(light, seed)
+    return _kept_sky(light, seed if light.cloud_cover else 0)
+
+
+@lru_cache(maxsize=8)
+def _kept_sky(light: Light, seed: int) -> Sky:
+    if light != Light():
+        return _photographed(light) if light.hdri else _procedural(light, seed)
+
+    def make() -> dict[str, NDArray[Any]]:
+        return {field: np.asarray(value) for field, value in asdict(_procedural(light, seed)).items()}
+
+    kept = baked(f"sky-{seed}", _MADE_BY, make)
+    sky: dict[str, Any] = {f: np.asarray(value) if value.size > 1 else value.item() for f, value in kept.items()}
+    return Sky(**sky)
 
 
 def directions(rows: int) -> Floats:

@@ -24,13 +24,12 @@ from cosim.spec.scenario import Barrier, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.street.furniture import Prop, footprints
-from physics.world.street_surface import StreetSurface
 from physics.world.surface import Surface
 from physics.world.world import BulletWorld
 from scenarios.builders.barriers import fenced
 from scenarios.execution.directing import director_of
 from scenarios.execution.injected import InjectedPeople
-from scenarios.execution.places import place
+from scenarios.execution.places import place, surface_of_place
 from scenarios.execution.scorer import Scorer
 from scenarios.rendering.link import SharedCamera
 from sumo_nets.crowd.crowd import SumoCrowd
@@ -75,7 +74,7 @@ def staged(
     around = shapely.buffer(LineString(scenario.route), CORRIDOR_M)
     walkable = street_map.walkable_near(around)
     with ExitStack() as stack:
-        street = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
+        street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
         world = stack.enter_context(world_of(street, scenario.barriers, robot))
         crowd = stack.enter_context(crowd_of(scenario))

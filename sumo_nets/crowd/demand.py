@@ -15,7 +15,7 @@ import numpy as np
 from cosim.core.geometry import Floats, heading_to_sumo
 from cosim.core.state import Age
 from cosim.place.street_map import Port, StreetMap
-from cosim.place.walk_graph import WalkGraph
+from cosim.place.walk_graph import walk_graph_of
 from cosim.spec.scenario import CrowdSpec
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.group_cohesion import Together
@@ -86,7 +86,7 @@ class Pedestrians:
         self._engine, self._entrances, self._spec, self._rng, self._closed = engine, entrances, spec, rng, closed
         self._together = together
         self.ages = entrances.ages
-        self._graph = WalkGraph(street_map)
+        self._graph = walk_graph_of(street_map)
         self._widths_m = {s.id: s.width_m for s in street_map.strips.values()}
         self._spots = Spots(
             (
@@ -96,7 +96,7 @@ class Pedestrians:
             ),
             step_m=2.0,
         )
-        self._room = Room(street_map, spec.radius_m)
+        self._room = None if spec.density is None else Room(street_map, spec.radius_m)
         self._groups = GroupDraws(spec, rng.spawn(1)[0])
 
     def fill(self, x_m: float, y_m: float) -> None:
@@ -105,7 +105,7 @@ class Pedestrians:
 
     def wanted(self, x_m: float, y_m: float) -> int:
         """How many persons there should be within the crowd's radius of a point."""
-        if self._spec.density is None:
+        if self._room is None or self._spec.density is None:
             return self._spec.persons
         return round(self._spec.density * self._room.area_m2(x_m, y_m) / 1000.0)
 
@@ -267,7 +267,7 @@ class Drivers:
             for _ in range(missing if ring else 0):
                 self._enter(ring)
 
-    def _enter(self, ring: list[int]) -> None:
+    def _enter(self, ring: list[tuple[int, int]]) -> None:
         spot = self._spots[ring[int(self._rng.integers(len(ring)))]]
         route = self._route(spot.edge)
         kinds = list(VEHICLE_TYPES)

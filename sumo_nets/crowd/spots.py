@@ -25,29 +25,43 @@ class EntrySpot(NamedTuple):
 
 
 class Spots:
-    """Where somebody may enter: points every `step_m` along lines, found by their distance."""
+    """Where somebody may enter: points every `step_m` along lines, made for the lines that are asked about."""
 
     def __init__(self, lines: Iterable[tuple[str, Floats, float, float]], step_m: float) -> None:
         """lines: edge id, (N, 2) metres, and how much to leave free at its start and end in metres."""
-        self._edges: list[str] = []
-        shares: list[Floats] = [np.zeros(0)]
-        poses: list[Floats] = [np.zeros((0, 3))]
-        for edge, xy, start_m, end_m in lines:
+        self._lines, self._step_m = list(lines), step_m
+        self._made: dict[int, tuple[Floats, Floats]] = {}
+        points = [line for _, line, _, _ in self._lines]
+        starts = np.cumsum([0, *map(len, points)])[:-1]
+        if points:
+            whole = np.concatenate(points)
+            self._low, self._high = np.minimum.reduceat(whole, starts), np.maximum.reduceat(whole, starts)
+
+    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[tuple[int, int]]:
+        """The spots at a distance in [low_m, high_m), each by the number of its line and its own on it."""
+        if not self._lines:
+            return []
+        beside = np.maximum(np.maximum(self._low - (x_m, y_m), (x_m, y_m) - self._high), 0.0)
+        lines = np.flatnonzero((beside * beside).sum(axis=1) <= high_m * high_m + 1.0)
+        poses = [self._on(number)[1] for number in lines.tolist()]
+        numbers = np.repeat(lines, [len(on) for on in poses])
+        places = np.concatenate([np.arange(len(on)) for on in poses] or [numbers])
+        gap = np.concatenate([on[:, :2] for on in poses] or [np.zeros((0, 2))]) - (x_m, y_m)
+        here = ((gap * gap).sum(axis=1) <= high_m * high_m) & (np.hypot(gap[:, 0], gap[:, 1]) >= low_m)
+        return list(zip(numbers[here].tolist(), places[here].tolist(), strict=True))
+
+    def __getitem__(self, spot: tuple[int, int]) -> EntrySpot:
+        number, k = spot
+        shares, poses = self._on(number)
+        return EntrySpot(self._lines[number][0], float(shares[k]), Pose(*poses[k].tolist()))
+
+    def _on(self, number: int) -> tuple[Floats, Floats]:
+        """(N,) shares and (N, 3) poses of the spots of a line."""
+        if number not in self._made:
+            _, xy, start_m, end_m = self._lines[number]
             line = Polyline(xy)
-            s = np.arange(start_m, line.length_m - end_m, step_m)
+            s = np.arange(start_m, line.length_m - end_m, self._step_m)
             x, y = (np.interp([s - 0.1, s, s + 0.1], line.s_m, line.points[:, k]) for k in (0, 1))
-            self._edges += [edge] * len(s)
-            shares.append(s / line.length_m)
-            poses.append(np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])]))
-        self._shares = np.concatenate(shares)
-        self._poses = np.concatenate(poses)
-
-    def ring(self, x_m: float, y_m: float, low_m: float, high_m: float) -> list[int]:
-        """The numbers of the spots at a distance in [low_m, high_m)."""
-        gap = self._poses[:, :2] - (x_m, y_m)
-        inside = np.flatnonzero((gap * gap).sum(axis=1) <= high_m * high_m)
-        near: list[int] = inside[np.hypot(*gap[inside].T) >= low_m].tolist()
-        return near
-
-    def __getitem__(self, number: int) -> EntrySpot:
-        return EntrySpot(self._edges[number], float(self._shares[number]), Pose(*self._poses[number].tolist()))
+            poses = np.column_stack([x[1], y[1], np.arctan2(y[2] - y[0], x[2] - x[0])])
+            self._made[number] = s / line.length_m, poses
+        return self._made[number]
