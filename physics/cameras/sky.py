@@ -77,13 +77,12 @@ class Sky:
         return math.asin(float(np.clip(self.sun[2], -1.0, 1.0)))
 
 
-def sky_of(light: Light, seed: int = 0) -> Sky:
-    """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the user's."""
-    return _kept_sky(light, seed if light.cloud_cover else 0)
-
-
 @lru_cache(maxsize=8)
-def _kept_sky(light: Light, seed: int) -> Sky:
+def sky_of(light: Light, seed: int = 0) -> Sky:
+    """The sky of a light; seed: of the clouds. Raises SpecError naming a broken picture of the user's.
+
+    That of the light which a scenario has by default is baked.
+    """
     if light != Light():
         return _photographed(light) if light.hdri else _procedural(light, seed)
 

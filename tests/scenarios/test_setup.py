@@ -5,7 +5,10 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from tests.conftest import PATIENCE_S
+from tests.scenarios.in_turn import COUNT
 
 NOT_DRIVEN_WITH = (
     "pandas",
@@ -31,3 +34,12 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[-3:-1] == ["[]", "True"]
+
+
+@pytest.mark.engine
+def test_the_kth_episode_of_a_process_is_the_first_one_of_another() -> None:
+    """30 episodes, two cities, many crowds, grounds, robots and lights in random order: same states, same pictures."""
+    command = [sys.executable, "-m", "tests.scenarios.in_turn"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split("\n")[-2] == f"[] {COUNT} {COUNT}", done.stderr
