@@ -11,10 +11,10 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from cosim.core.geometry import Floats
 from cosim.people.steering import SHOULDER_TO_SHOULDER_M
+from sumo_nets.crowd.near_pairs import pairs_within
 
 SHOULDERS_M: Final = SHOULDER_TO_SHOULDER_M
 """Least distance of the middles of two people: shoulders touch. SUMO's queues, 0.465 m apart, stay as they are."""
@@ -97,7 +97,7 @@ def _pairs(xy: Floats, firm: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArr
     nobody = np.zeros(0, dtype=np.intp)
     if len(xy) < 2:
         return nobody, nobody
-    pairs = cKDTree(xy).query_pairs(_NEAR_M, output_type="ndarray")
+    pairs = pairs_within(xy, _NEAR_M)
     if not len(pairs):
         return nobody, nobody
     one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T

@@ -85,7 +85,7 @@ def _as_the_first(work: Callable[[], str]) -> str:
         finally:
             os._exit(0)
     os.close(writing)
-    with open(reading) as answer:
+    with os.fdopen(reading) as answer:
         said = answer.read()
     os.waitpid(child, 0)
     return said

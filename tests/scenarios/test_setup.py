@@ -13,6 +13,7 @@ from tests.scenarios.in_turn import COUNT
 NOT_DRIVEN_WITH = (
     "pandas",
     "pyproj",
+    "scipy",
     "sumo_nets.maps.importer",
     "sumo_nets.net.netfile",
     "sumolib",
