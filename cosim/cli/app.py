@@ -151,6 +151,7 @@ def run_command(
     loaded = load_policy(policy)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
+    asks = shared_renderer and check_shared(loaded, drawn_by)
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
@@ -171,7 +172,6 @@ def run_command(
         director=outside,
         counterfactual=counterfactual,
     )
-    asks = shared_renderer and check_shared(loaded, drawn_by)
     spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:
         if on_air is not None:

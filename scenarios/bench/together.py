@@ -14,9 +14,8 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.state import Command
-from cosim.episode.ports import Observation
-from cosim.policies.route import Route
-from scenarios.bench.driving import FourHertz
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.policies.baselines import Straight
 from scenarios.bench.figures import MORE, Figure
 
 ENVIRONMENTS: Final = 10
@@ -25,22 +24,16 @@ _MEASURED_S: Final = 30.0
 """Simulated seconds of each environment, on average, that the figure is taken from."""
 
 
-class RoutesTogether(FourHertz):
-    """The route policy for many episodes at once, with the pictures in one array, as a model would want them."""
+class StraightTogether(Straight):
+    """Drives straight on in all episodes at once, slower where it is dark: all pictures go into one array, as a model
+    would want them."""
 
-    def __init__(self) -> None:
-        self._routes: dict[str, Route] = {}
-
-    def reset(self, scenario_id: str, seed: int) -> None:
-        self._routes[scenario_id] = route = Route()
-        route.reset(scenario_id, seed)
-
-    def act(self, observation: Observation) -> Command:
-        return self.act_batch([observation])[0]
+    manifest = Manifest("straight-together", rate_hz=4.0, camera=CameraSpec(96, 96))
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
-        np.stack([one.rgb for one in observations if one.rgb is not None])
-        return [self._routes[one.episode].act(one) for one in observations]
+        pictures = np.stack([one.rgb for one in observations if one.rgb is not None])
+        paces = np.clip(pictures.mean(axis=(1, 2, 3)) / 64.0, 0.5, 1.0).tolist()
+        return [Command(pace * one.robot.cruise_mps, 0.0) for one, pace in zip(observations, paces, strict=True)]
 
 
 def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -> list[Figure]:
@@ -63,7 +56,7 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
         msgspec.structs.replace(shipped[i % len(shipped)], id=f"together-{i}", seed=i) for i in range(environments)
     ]
     suite = Suite(name="together", version="1", scenarios=tuple(picked))
-    name = f"{__name__}:{RoutesTogether.__name__}"
+    name = f"{__name__}:{StraightTogether.__name__}"
     driver, options = load_policy(name), EpisodeOptions(camera="gl")
     hello, watch = Hello(name, driver.manifest, driver.source_hash), _Watch(environments)
     with ExitStack() as stack:

@@ -8,34 +8,33 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Self
 
 import msgspec
 import numpy as np
 import pytest
 import shapely
 
-import cosim
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
-from cosim.records.run_folder import RunFolder, read_records, read_spec
+from cosim.records.run_folder import read_records, read_spec
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import Light, Scenario, Suite
+from cosim.spec.scenario import Light, Scenario, Suite, write_suite
 from scenarios.bench.cameras import busy_street
 from scenarios.checks import small_scenario
+from scenarios.execution import suite_run
 from scenarios.execution.asked import Patience
-from scenarios.execution.messages import Hello, Message, Progress
+from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.places import place
-from scenarios.execution.pool import run_all
-from scenarios.execution.process import LocalProcesses
-from scenarios.execution.suite_run import run_spec
 from scenarios.rendering.exchange import Ask, Begin, Draw, Enter, Fine, Knowledge, Refused, Reply, Request, Told
 from scenarios.rendering.link import RendererLink
 from scenarios.rendering.memory import PictureMemory
 from scenarios.rendering.shared import End, SharedRenderer, check_shared
+from tests.conftest import Cosim
 from tests.scenarios.shared_policies import NOTES, Knowing, Seeing, Together
 
 OF = "tests.scenarios.shared_policies"
@@ -217,7 +216,7 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
 def by_themselves(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two episodes in this process, each drawing for itself."""
     folder = tmp_path_factory.mktemp("runs") / "own"
-    cosim.run(suite_of("a", "b"), Seeing(), out=folder, options=FRAMES)
+    suite_run.run(suite_of("a", "b"), Seeing(), out=folder, options=FRAMES)
     return folder
 
 
@@ -231,45 +230,53 @@ def same(one: Path, other: Path) -> bool:
 
 @pytest.mark.engine
 def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
-    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosim: Cosim
 ) -> None:
     """Two processes, drawn for and asked by a third: state hashes and pictures are those of episodes that each drew for
-    themselves, in one process; the run's folder says how it was run, and every question was put by one process."""
+    themselves, in one process; run.json says how it was run, and every question was put by one process."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
-    folder = tmp_path / "shared"
-    suite = suite_of("a", "b")
-    cosim.run(suite, f"{OF}:Together", jobs=2, shared_renderer=True, out=folder, options=FRAMES)
-    assert same(by_themselves, folder) and read_spec(folder).shared_renderer
+    write_suite(suite_of("a", "b"), tmp_path / "small.json")
+    words = ("--policy", f"{OF}:Together", "--frames", "0.5", "--out", "shared")
+    said = cosim("run", "small.json", *words, "--jobs", "2", "--shared-renderer", cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    assert same(by_themselves, tmp_path / "shared") and read_spec(tmp_path / "shared").shared_renderer
     notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
     assert len({line[0] for line in notes}) == 1 and sum(len(line) - 1 for line in notes) == 8
-    resumed = cosim.run(suite, f"{OF}:Together", out=folder, resume=True)
-    assert len(resumed) == 2
+    assert cosim("run", "small.json", *words, "--resume", cwd=tmp_path).returncode == 0
 
 
 @pytest.mark.engine
-def test_episodes_whose_renderer_is_killed_are_run_again(by_themselves: Path, tmp_path: Path) -> None:
+def test_episodes_whose_renderer_is_killed_are_run_again(
+    by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """kill -9 in the middle of two episodes: another renderer draws them from their beginning, none has crashed, and
     what comes out is the same as ever."""
-    suite, name = suite_of("a", "b"), f"{OF}:Seeing"
-    driver = load_policy(name)
-    hello = Hello(name, driver.manifest, driver.source_hash)
-    options = msgspec.structs.replace(FRAMES, camera="gl", suite_hash=suite.content_hash)
-    killed = []
+    started: list[SharedRenderer] = []
+    killed: list[int] = []
 
-    def kill(message: Message) -> None:
+    class Noted(SharedRenderer):
+        def __enter__(self) -> Self:
+            started.append(self)
+            return super().__enter__()
+
+    def kill(message: object) -> None:
         if isinstance(message, Progress) and not killed:
-            killed.append(renderer_pid(renderer))
+            killed.append(renderer_pid(started[0]))
             os.kill(killed[0], signal.SIGKILL)
 
-    spec = run_spec(suite, suite.scenarios, name, driver, options, shared=True)
-    with RunFolder.create(tmp_path / "run", spec, suite) as folder:
-        transport, logs = LocalProcesses(folder.path / "logs"), folder.path / "logs"
-        with SharedRenderer(logs, hello, asks=False) as renderer:
-            run_all(folder, suite.scenarios, hello, transport, jobs=2, tell=kill, options=options, renderer=renderer)
-    assert killed and same(by_themselves, folder.path)
-    assert sorted(path.name for path in logs.iterdir()) == [
-        "renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log",
-    ]  # fmt: skip
+    monkeypatch.setattr(suite_run, "SharedRenderer", Noted)
+    monkeypatch.setattr(suite_run, "_untold", kill)
+    folder = tmp_path / "run"
+    suite_run.run(suite_of("a", "b"), f"{OF}:Seeing", jobs=2, shared_renderer=True, out=folder, options=FRAMES)
+    assert killed and same(by_themselves, folder)
+    logs = sorted(path.name for path in (folder / "logs").iterdir())
+    assert logs == ["renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log"]
+
+
+def test_what_a_shared_renderer_cannot_do_is_wrong_use(cosim: Cosim) -> None:
+    """It is told before anything is started."""
+    said = cosim("run", "reactive", "--camera", "bullet", "--shared-renderer")
+    assert said.returncode == 2 and "--shared-renderer draws by OpenGL, not by the bullet camera" in said.stderr
 
 
 def test_where_there_is_nothing_to_share_it_is_said() -> None:
@@ -281,7 +288,7 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
     with pytest.raises(UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"):
         check_shared(Driver(Seeing()), "bullet")
     with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
-        cosim.run(suite_of("a"), Together(), shared_renderer=True)
+        suite_run.run(suite_of("a"), Together(), shared_renderer=True)
 
 
 def test_no_environment_can_shrink_its_memory_under_the_renderers_hands() -> None:
