@@ -13,7 +13,7 @@ from cosim.core.geometry import Floats
 from physics.people.arms import arms
 from physics.people.clips import bind_of
 from physics.people.families import Family, man_rest_m, skeleton
-from physics.people.figure import LEVELS, MESH_LEVELS, Build, Legs, Sleeve, legs, torso_pieces
+from physics.people.figure import LEVELS, MESH_LEVELS, RIBBONS, Build, Legs, Sleeve, legs, torso_pieces
 from physics.people.head import about_head, neck_and_head
 from physics.people.lofts import Piece, lofted, tube
 from physics.people.skeleton import Skeleton, model_pose
@@ -57,8 +57,8 @@ class SkinnedBody:
 @dataclass(frozen=True, slots=True)
 class FarBody:
     """A body of tubes, whose rings are turned towards the eye when it is drawn (`lofts.Tube`). middle, ahead, side
-    (V, 3); ring (V, 4); still (V,) whose rings are not turned; the
-    rest as in Body."""
+    (V, 3); ring (V, 4); still (V,) whose rings are not turned; ribbon (V,) of outlines alone; the rest as in
+    SkinnedBody."""
 
     middle: NDArray[np.float32]
     ahead: NDArray[np.float32]
@@ -70,6 +70,7 @@ class FarBody:
     coat: NDArray[np.uint8]
     fat: NDArray[np.float32]
     still: NDArray[np.bool_]
+    ribbon: NDArray[np.bool_]
 
 
 @lru_cache(maxsize=128)
@@ -99,10 +100,11 @@ def body(outfit: Outfit, level: int) -> SkinnedBody:
 
 @lru_cache(maxsize=128)
 def far_body(outfit: Outfit, level: int) -> FarBody:
-    """The body at a level of tubes, MESH_LEVELS to LEVELS - 1."""
+    """The body at a level of tubes or ribbons, MESH_LEVELS to LEVELS - 1."""
     if not MESH_LEVELS <= level < LEVELS:
         raise ValueError(f"levels of tubes go from {MESH_LEVELS} to {LEVELS - 1}: {level}")
-    tubes = [(piece.coat, tube(piece, level)) for piece in pieces(outfit) if piece.sides[level]]
+    ribbon, of = level == RIBBONS, min(level, RIBBONS - 1)
+    tubes = [(piece.coat, tube(piece, of, ribbon)) for piece in pieces(outfit) if piece.sides[of]]
     starts = np.cumsum([0, *(len(t.middle) for _, t in tubes)])
     weights = np.concatenate([_sided(t.corners, t.weights) if t.still else t.weights for _, t in tubes])
     even = np.concatenate([t.weights for _, t in tubes])
@@ -120,7 +122,10 @@ def far_body(outfit: Outfit, level: int) -> FarBody:
         few,
         coat.astype(np.uint8),
         np.concatenate([t.fat for _, t in tubes]).astype(np.float32),
-        np.repeat([t.still for _, t in tubes], [len(t.middle) for _, t in tubes]),
+        *(
+            np.repeat(kind, [len(t.middle) for _, t in tubes])
+            for kind in zip(*((t.still, t.ribbon) for _, t in tubes), strict=True)
+        ),
     )
 
 

@@ -11,9 +11,11 @@ from typing import Final, Literal
 
 from physics.people.lofts import Joints, Piece, Ring
 
-LEVELS: Final = 4
-"""Levels of detail: two of meshes, then two of tubes."""
+LEVELS: Final = 5
+"""Levels of detail: two of meshes, then two of tubes, then one of ribbons."""
 MESH_LEVELS: Final = 2
+RIBBONS: Final = LEVELS - 1
+"""The level of ribbons: the outlines of the tubes before it."""
 Sleeve = Literal["long", "short"]
 Legs = Literal["trousers", "shorts", "skirt", "coat"]
 

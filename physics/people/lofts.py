@@ -77,12 +77,12 @@ def lofted(piece: Piece, level: int) -> LoftedPiece:
 
 @dataclass(frozen=True, slots=True)
 class Tube:
-    """A piece whose rings a renderer turns towards the eye: two corners of each lie on its outline from there, so that
-    few corners draw the outline of the round ring.
+    """A piece whose rings a renderer turns towards the eye: the first and the last corner of each lie on its outline
+    from there, those between before it, and nothing behind it, so that few corners draw the outline of the round ring.
 
     middle, ahead, side: (V, 3) of the corner's ring; ring: (V, 4) back, square, cosine and sine of the angle from the
-    outline to the corner; triangles (T, 3); weights (V, 24); fat (V,). still: its corners are not turned, their
-    angles begin at `ahead`.
+    outline to the corner; triangles (T, 3); weights (V, 24); fat (V,). still: its corners are not turned and run all
+    around, their angles begin at `ahead`. ribbon: it is nothing but its outline.
     """
 
     middle: Floats
@@ -93,6 +93,7 @@ class Tube:
     weights: Floats
     fat: Floats
     still: bool
+    ribbon: bool
 
     @property
     def corners(self) -> Floats:
@@ -100,38 +101,47 @@ class Tube:
         return np.asarray(self.middle + self.ring[:, 2:3] * self.ahead + self.ring[:, 3:4] * self.side)
 
 
-def tube(piece: Piece, level: int) -> Tube:
-    """A piece at a coarse level, with an even number of sides. One that follows both legs spreads to its sides, which
-    rings turned towards the eye cannot show: its corners stay where they are, and there are more."""
+def tube(piece: Piece, level: int, ribbon: bool = False) -> Tube:
+    """A piece at a coarse level, with an even number of sides; as a ribbon if it is an upright one. One that follows
+    both legs spreads to its sides, which rings turned towards the eye cannot show: its corners stay where they are,
+    and there are more."""
     table, sides = _chosen(_table(piece.rings), piece.rings_kept[level]), piece.sides[level]
     spreads = bool((np.minimum(table[:, 12 + INDEX["left_hip"]], table[:, 12 + INDEX["right_hip"]]) > 0.15).any())
     if spreads:
-        sides = max(2 * sides, 10)
+        sides = 6 if ribbon else max(2 * sides, 10)
         table[:, 3:9] *= np.pi / (sides * np.sin(np.pi / sides))
     angle = 2.0 * np.pi * (np.arange(sides) + 0.5 * spreads) / sides
     solid = np.concatenate([_points(table, angle).reshape(-1, 3), table[[0, -1], :3]])
     triangles = _sheet(len(table), sides)
-    if _volume(solid, triangles) < 0.0:
-        triangles = triangles[:, ::-1].copy()
-    poles = table[[0, -1]]
+    outward = _volume(solid, triangles) > 0.0
+    way = np.abs(table[-1, :3] - table[0, :3])
+    ribbon = ribbon and not spreads and bool(way[2] > way[0])  # who looks along a ribbon sees nothing of it
+    if not spreads:
+        angle = np.array([0.0, np.pi]) if ribbon else angle[: sides // 2 + 1]
+        triangles = _sheet(len(table), len(angle), open_=True, capped=not ribbon)
+    poles = table[:0] if ribbon else table[[0, -1]]
     poles[:, 3:9] *= 1e-3
-    rows = np.concatenate([np.repeat(table, sides, axis=0), poles])
-    corner = np.concatenate([np.tile(angle, len(table)), [0.0, 0.0]])
+    rows = np.concatenate([np.repeat(table, len(angle), axis=0), poles])
+    corner = np.concatenate([np.tile(angle, len(table)), np.zeros(len(poles))])
     ring = np.column_stack([rows[:, 9:11], np.cos(corner), np.sin(corner)])
-    return Tube(rows[:, :3], rows[:, 3:6], rows[:, 6:9], ring, triangles, _shares(rows[:, 12:]), rows[:, 36], spreads)
+    triangles = triangles if outward else triangles[:, ::-1].copy()
+    return Tube(
+        rows[:, :3], rows[:, 3:6], rows[:, 6:9], ring, triangles, _shares(rows[:, 12:]), rows[:, 36], spreads, ribbon
+    )
 
 
 @lru_cache(maxsize=256)
-def _sheet(rings: int, sides: int) -> NDArray[np.int32]:
-    """(T, 3) triangles between rings of vertices one after another, and to the two poles behind them."""
+def _sheet(rings: int, sides: int, open_: bool = False, capped: bool = True) -> NDArray[np.int32]:
+    """(T, 3) triangles between rings of vertices one after another, and to the two poles behind them. Rings that are
+    open have no side from the last vertex to the first."""
     n, k = rings, sides
-    around, after = np.arange(k), (np.arange(k) + 1) % k
+    around, after = np.arange(k)[: k - open_], ((np.arange(k) + 1) % k)[: k - open_]
     base = k * np.arange(n - 1)[:, None]
     quads = [base + around, base + after, base + k + after, base + around, base + k + after, base + k + around]
     sheet = np.moveaxis(np.stack(quads), 0, -1).reshape(-1, 3)
-    low = np.stack([np.full(k, n * k), after, around], 1)
-    high = np.stack([np.full(k, n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
-    whole = np.concatenate([sheet, low, high]).astype(np.int32)
+    low = np.stack([np.full(len(around), n * k), after, around], 1)
+    high = np.stack([np.full(len(around), n * k + 1), (n - 1) * k + around, (n - 1) * k + after], 1)
+    whole = np.concatenate([sheet, low, high] if capped else [sheet]).astype(np.int32)
     whole.flags.writeable = False
     return whole
 

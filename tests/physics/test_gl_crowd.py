@@ -24,7 +24,7 @@ from physics.cameras.sky import sky_of
 from physics.cameras.view import Shot, shot
 from physics.people.body import body
 from physics.people.clips import own_clips
-from physics.people.figure import LEVELS
+from physics.people.figure import LEVELS, RIBBONS
 from physics.people.looks import ALL, look_of
 from physics.people.poses import poses
 from tests.physics.blend import skinned
@@ -82,7 +82,7 @@ def crowd() -> Iterator[CrowdDrawing]:
 
 
 def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In pictures of busy streets levels of detail change less than 2 % of the silhouettes' pixels."""
+    """In pictures of busy streets levels of detail change less than 3 % of the silhouettes' pixels."""
     taken = shot((0.0, 0.0, 0.6), (10.0, 0.0, 0.6), WIDE, 75.0)
     scenes = [street(seed) for seed in range(4)]
     levelled = [mask(crowd, people, taken) for people in scenes]
@@ -91,14 +91,14 @@ def test_levels_of_detail_keep_the_silhouettes(crowd: CrowdDrawing, monkeypatch:
     changed = sum(int((a ^ b).sum()) for a, b in zip(levelled, full, strict=True))
     total = sum(int(b.sum()) for b in full)
     print(f"{100 * changed / total:.2f} % of {total} silhouette pixels changed")
-    assert changed < 0.02 * total
+    assert changed < 0.03 * total
 
 
 @pytest.mark.parametrize("level", range(1, LEVELS))
 def test_each_level_is_like_full_detail_where_it_begins(
     crowd: CrowdDrawing, monkeypatch: pytest.MonkeyPatch, level: int
 ) -> None:
-    """At the size at which a level begins it changes less than 2 % of silhouette pixels, the coarsest less than 3 %."""
+    """At the size at which a level begins it changes less than 3 % of silhouette pixels, ribbons less than 4 %."""
     far = 1.75 / LEVEL_PX[level - 1] * 0.5 * WIDE[1] / np.tan(np.radians(37.5))
     taken = shot((-1.02 * far, 0.0, 0.6), (0.0, 0.0, 0.6), WIDE, 75.0)
     changed = total = 0
@@ -111,7 +111,7 @@ def test_each_level_is_like_full_detail_where_it_begins(
             shown.append(mask(crowd, people, taken))
         changed, total = changed + int((shown[0] ^ shown[1]).sum()), total + int(shown[1].sum())
     print(f"level {level}, {LEVEL_PX[level - 1]:.0f} pixels tall: {100 * changed / total:.2f} % changed")
-    assert changed < (0.03 if level == LEVELS - 1 else 0.02) * total
+    assert changed < (0.04 if level == RIBBONS else 0.03) * total
 
 
 def test_the_card_skins_as_the_reference_does(crowd: CrowdDrawing) -> None:

@@ -47,7 +47,7 @@ class GlCamera(WorldCamera):
             world, light = self._world, self._light
             with context() as gl:
                 scene = GlScene(gl, batch_drawing(gl).forms, world.surface, world.barriers, light)
-                shadows = ShadowMaps(gl) if light.shadows else None
+                shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
                 self._stage = Stage(world.surface, world.robot, scene, shadows, Backdrop(gl, self._sky), light)
             self._context = gl
         return self

@@ -29,7 +29,7 @@ from physics.people.figure import LEVELS, MESH_LEVELS
 from physics.people.looks import ALL, look_of
 from physics.people.poses import bodies_of, loops_of, poses_of
 
-LEVEL_PX: Final = (170.0, 56.0, 22.0)
+LEVEL_PX: Final = (170.0, 80.0, 44.0, 32.0)
 """Drawn height of a body, in pixels, below which the next coarser level is taken."""
 CAST_M: Final = 18.0
 """How far from the eye people throw shadows."""

@@ -24,6 +24,8 @@ STEP_M: Final = 8.0
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
+_SMALL_PX: Final = 160
+"""Pictures that are not higher show no difference between maps of these sizes and of half of them."""
 TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
 """From clip space to the space of a texture."""
 
@@ -33,13 +35,13 @@ def middle_of(eye_m: Floats) -> Floats:
     return np.asarray(np.round(eye_m / STEP_M) * STEP_M)
 
 
-def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats) -> Floats:
-    """(4, 4) from metres relative to the anchor to the clip space of the maps."""
+def shadow_matrix(middle: Floats, anchor: Floats, to_sun: Floats, side_px: int = _STILL_PX) -> Floats:
+    """(4, 4) from metres relative to the anchor to the clip space of the maps. side_px: of the finer one."""
     sun = to_sun / np.linalg.norm(to_sun)
     across = np.cross((0.0, 0.0, 1.0), sun)
     across = across / np.linalg.norm(across) if np.linalg.norm(across) > 1e-6 else np.array([1.0, 0.0, 0.0])
     rows = np.stack([across, np.cross(sun, across), -sun])
-    texel = 2.0 * SHADOW_REACH_M / _STILL_PX
+    texel = 2.0 * SHADOW_REACH_M / side_px
     centre = rows @ middle
     centre[:2] = np.round(centre[:2] / texel) * texel
     shift = rows @ np.array([*anchor, 0.0]) - centre
@@ -60,11 +62,13 @@ def casting(context: moderngl.Context) -> Iterator[None]:
 
 
 class ShadowMaps:
-    """Two depth pictures from the sun."""
+    """Two depth pictures from the sun. high_px: of the pictures that they are for."""
 
-    def __init__(self, context: moderngl.Context) -> None:
+    def __init__(self, context: moderngl.Context, high_px: int) -> None:
         self._context = context
-        self._still, self._moving = (self._texture(pixels) for pixels in (_STILL_PX, _MOVING_PX))
+        share = 2 if high_px <= _SMALL_PX else 1
+        self._side_px = _STILL_PX // share
+        self._still, self._moving = self._texture(self._side_px), self._texture(_MOVING_PX // share)
         self._frames = {
             "still": context.framebuffer(depth_attachment=self._still),
             "moving": context.framebuffer(depth_attachment=self._moving),
@@ -84,7 +88,7 @@ class ShadowMaps:
         """`shadow_matrix`, and the same to the space of a texture; the last ones are kept."""
         key = (*middle.tolist(), *anchor.tolist())
         if key != self._matrices_for:
-            from_at = shadow_matrix(middle, anchor, light.to_sun)
+            from_at = shadow_matrix(middle, anchor, light.to_sun, self._side_px)
             self._matrices_for, self._matrices = key, (from_at, TO_TEXTURE @ from_at)
         return self._matrices
 

@@ -34,7 +34,7 @@ FAR_CORNER: Final = np.dtype(
         ("coat", "u1", 4),
     ]
 )
-"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, one spare."""
+"""A corner of a tube; coat: row of COATS, how far fat stands out, whether it is not turned, whether of a ribbon."""
 
 _MESH_LAYOUT: Final = ("3f4 4f1 4u1 4f1 4u1", "in_at", "in_normal", "in_joints", "in_weights", "in_coat")
 _TUBE_LAYOUT: Final = (
@@ -86,14 +86,19 @@ void main() {
     half_ += stout;
     vec3 ray = TOWARDS;
     vec2 across = normalize(vec2(-dot(side, ray), dot(ahead_, ray)) + 1e-7);
-    vec2 way = in_ring.z * across + in_ring.w * vec2(-across.y, across.x);
+    vec2 before = vec2(-across.y, across.x);
+    vec2 way = in_ring.z * across + in_ring.w * before;
     if (still) way = in_ring.zw;
+    float ribbon = still ? 0.0 : float(in_coat.w);
+    float near = length(vec2(before.x < 0.0 ? half_.x * in_ring.x : half_.x, half_.y) * before);
     if (way.x < 0.0) half_.x *= in_ring.x;
     // the corner is where the outline of a superellipse has the normal `way`
     float dual = in_ring.y / (in_ring.y - 1.0);
-    vec2 lean = max(half_ * abs(way), 1e-9);
-    float wide = pow(pow(lean.x, dual) + pow(lean.y, dual), 1.0 / dual);
-    vec2 corner = half_ * sign(way) * pow(lean / wide, vec2(dual - 1.0));
+    vec2 lean = max(half_ * abs(way), 1e-9), power = pow(lean, vec2(dual));
+    vec2 corner = half_ * sign(way) * (power / lean) * pow(power.x + power.y, -1.0 / in_ring.y);
+    // a ribbon lies where the tube is nearest, and is shaded as if it were round
+    corner += before * (near * ribbon * RAISED);
+    way = normalize(way + ribbon * before);
     at = middle + ahead_ * corner.x + side * corner.y;
     normal = ahead_ * way.x + side * way.y;
     gl_Position = project(at);
@@ -183,8 +188,8 @@ def tube_skins(context: moderngl.Context, made: Callable[[int, int], FarBody]) -
 
     def drawn(shadows: bool) -> Programs:
         seen, cast = (
-            programs(context, f"#define TOWARDS ({ray})\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
-            for ray in ("middle - eye.xyz", "sun.xyz")
+            programs(context, f"#define TOWARDS ({ray})\n#define RAISED {raised}\n" + _SKIN + _TUBE, _FRAGMENT, shadows)
+            for ray, raised in (("middle - eye.xyz", 1.0), ("sun.xyz", 0.0))
         )
         return Programs(seen.colour, cast.shadow)
 
@@ -208,7 +213,7 @@ def far_corners(made: FarBody) -> NDArray[np.void]:
     rows["middle"], rows["ahead"], rows["side"], rows["ring"] = made.middle, made.ahead, made.side, made.ring
     rows["joints"], rows["weights"] = made.joints, _bytes(made.weights)
     rows["coat"][:, 0], rows["coat"][:, 1] = made.coat, np.rint(255.0 * made.fat)
-    rows["coat"][:, 2] = made.still
+    rows["coat"][:, 2], rows["coat"][:, 3] = made.still, made.ribbon
     return rows
 
 
