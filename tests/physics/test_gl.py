@@ -17,6 +17,7 @@ from cosim.spec.scenario import Barrier, City, Light
 from physics.cameras.bullet_camera import BulletCamera
 from physics.cameras.gl import context
 from physics.cameras.gl.camera import GlCamera
+from physics.cameras.gl.targets import Target
 from physics.world.street_surface import StreetSurface
 from physics.world.world import BulletWorld
 from scenarios.execution.places import place
@@ -181,3 +182,25 @@ def test_a_camera_outside_its_with_block_says_so(world: BulletWorld) -> None:
     with camera:
         pass
     camera.close()
+
+
+@pytest.mark.parametrize("size", [(96, 96), (37, 21)], ids=["even", "odd"])
+def test_a_card_parts_colours_and_labels_as_the_processor_does(size: tuple[int, int]) -> None:
+    """What is parted by drawing it once more, as on a graphics card, is byte for byte what is parted after reading."""
+    rng = np.random.default_rng(size[0])
+    rgba = rng.integers(0, 256, (size[1], size[0], 4), dtype=np.uint8)
+    with context.context() as gl:
+        picture = gl.texture(size, 4, rgba.tobytes())
+        source, found = gl.framebuffer([picture]), []
+        for on_card in (False, True):
+            target = Target(gl, size, parts_on_card=on_card)
+            gl.copy_framebuffer(target.frame, source)
+            buffer = gl.buffer(reserve=rgba.nbytes + 16)
+            target.copy(buffer, 16)
+            found += [target.read(), target.parted(np.frombuffer(buffer.read(offset=16), dtype=np.uint8))]
+            target.release()
+            buffer.release()
+        source.release()
+        picture.release()
+    for colours, labels in found:
+        assert np.array_equal(colours, rgba[..., :3]) and np.array_equal(labels, rgba[..., 3])

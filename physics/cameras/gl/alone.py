@@ -35,7 +35,7 @@ class PeopleAlone:
     def __enter__(self) -> Self:
         with context() as gl:
             self._crowd, self._blocks, self._target = CrowdDrawing(gl), SceneBlocks(gl), Target(gl, self._size)
-            self._readback = Readback(gl, self._size)
+            self._readback = Readback(gl, self._target)
         self._context = gl
         return self
 
@@ -68,7 +68,7 @@ class PeopleAlone:
             gl.depth_func = "<"
             self._crowd.draw("colour", shadows=False)
             self._readback.begin()
-            self._readback.copy(self._target)
+            self._readback.copy()
 
     def end(self) -> Frame:
         """The picture that began first and has not ended."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from functools import partial
 from itertools import count
 from types import TracebackType
 from typing import NewType, Self
@@ -49,7 +48,8 @@ class Atlas:
 
     def __enter__(self) -> Self:
         with context() as gl:
-            self._target, self._readback = Target(gl, self._size), Readback(gl, self._size)
+            self._target = Target(gl, self._size)
+            self._readback = Readback(gl, self._target)
         self._context = gl
         return self
 
@@ -97,7 +97,7 @@ class Atlas:
         with gl:
             self._readback.begin(len(batch))
             try:
-                batch_drawing(gl).draw(pictures, self._target, partial(self._readback.copy, self._target))
+                batch_drawing(gl).draw(pictures, self._target, self._readback.copy)
             except BaseException:
                 self._readback.forget()
                 raise

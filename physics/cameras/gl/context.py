@@ -45,6 +45,12 @@ def available() -> bool:
 
 
 @lru_cache(maxsize=1)
+def is_card(context: moderngl.Context) -> bool:
+    """Whether a graphics card draws, not the processor in its place."""
+    return not any(name in context.info["GL_RENDERER"] for name in ("llvmpipe", "softpipe", "swrast", "SWR"))
+
+
+@lru_cache(maxsize=1)
 def renderer() -> str:
     """The renderer as it is named in records: pictures are the same bits on the same renderer only."""
     with context() as gl:

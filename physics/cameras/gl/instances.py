@@ -75,9 +75,11 @@ void main() {{
 class Forms:
     """All forms by key, in one vertex and one index buffer; it grows when a key is new."""
 
-    def __init__(self, context: moderngl.Context, surfaces: Surfaces) -> None:
-        self._context, self._layers, self._known = context, surfaces.surfaces, surfaces.known
-        self._programs: dict[bool, Programs] = {}
+    def __init__(
+        self, context: moderngl.Context, surfaces: Surfaces, programs_of: dict[bool, Programs] | None = None
+    ) -> None:
+        self._context, self._surfaces = context, surfaces
+        self._programs: dict[bool, Programs] = {} if programs_of is None else programs_of
         self._corners: list[NDArray[np.void]] = []
         self._indices: list[NDArray[np.uint32]] = []
         self._ids: dict[Hashable, int] = {}
@@ -88,13 +90,17 @@ class Forms:
         self._held = -1
         self._buffers: tuple[moderngl.Buffer, moderngl.Buffer] | None = None
 
+    def apart(self) -> Forms:
+        """None yet, with the same programs: for forms that are to go with whoever brought them."""
+        return Forms(self._context, self._surfaces, self._programs)
+
     def programs(self, shadows: bool) -> Programs:
         """The programs of all forms, shaded by shadow maps or not."""
         if shadows not in self._programs:
             self._programs[shadows] = made = programs(self._context, KNOWN + _VERTEX, LOOKED_UP + _FRAGMENT, shadows)
             for uniform in made.uniforms("layers"):
                 if uniform is not None:
-                    uniform.write(self._known)
+                    uniform.write(self._surfaces.known)
         return self._programs[shadows]
 
     def id(self, key: Hashable, parts: Callable[[], Sequence[Part]]) -> int:
@@ -121,7 +127,7 @@ class Forms:
         colour = np.tile(part.colour, (len(shade), 1)) if part.colour else np.ones((len(shade), 3))
         rows = corners(part.mesh, colour * shade[:, None], _GLOW if part.glows else _OWN if part.colour else _PAINT)
         named = {"": _BARE, "lamp": _LAMP}
-        rows["normal"][:, 3] = named[part.cover] if part.cover in named else self._layers.index(part.cover)
+        rows["normal"][:, 3] = named[part.cover] if part.cover in named else self._surfaces.surfaces.index(part.cover)
         return rows
 
     def buffers(self) -> tuple[moderngl.Buffer, moderngl.Buffer]:

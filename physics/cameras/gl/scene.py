@@ -76,6 +76,8 @@ class GlScene:
         self._ground, self._paint = ground_layer(context, ground), ground_layer(context, ground)
         self._walls = wall_layer(context, walls)
         self._seen, self._standing = Things(context, forms), Things(context, forms)
+        self._fence_forms = forms.apart()  # there is no end of their sizes
+        self._fenced = Things(context, self._fence_forms)
         self._tiles: dict[Key, _Tile] = {}
         self._keys: list[Key] = []
         self._cell: tuple[int, int] | None = None
@@ -111,6 +113,7 @@ class GlScene:
         if stage == "colour":
             self._surfaces.bind()
         (self._seen if stage == "colour" else self._standing).draw(stage, self._shadows)
+        self._fenced.draw(stage, self._shadows)
         self._walls.draw(stage)
         self._ground.draw(stage)
 
@@ -119,8 +122,9 @@ class GlScene:
         self._paint.draw("colour")
 
     def release(self) -> None:
-        for held in (self._ground, self._paint, self._walls, self._seen, self._standing):
+        for held in (self._ground, self._paint, self._walls, self._seen, self._standing, self._fenced):
             held.release()
+        self._fence_forms.release()
         self._tiles.clear()
 
     def _stream(self, cell: tuple[int, int]) -> None:
@@ -155,7 +159,7 @@ class GlScene:
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
         self._stands = _joined(placed)
-        self._fenced = _joined([_NOTHING, *self._fences_now(anchor)])
+        self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]))
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
         """Take what can be in the picture of any eye in the cell that looks into the sector."""
@@ -167,7 +171,7 @@ class GlScene:
             tiles = _within(self._middles - np.multiply(cell, _CELL_M), sector, half, _TILE_REACH_M)
         rows = chosen.nonzero()[0]
         form, things = self._stands
-        self._seen.set(*_joined([(form[rows], things[rows]), self._fenced, self._lit]))
+        self._seen.set(*_joined([(form[rows], things[rows]), self._lit]))
         for layer in (self._ground, self._paint, self._walls):
             layer.show("colour", tiles.nonzero()[0])
 
@@ -176,7 +180,7 @@ class GlScene:
         still = (*middle.tolist(), *anchor.tolist())
         if still != self._still_for:
             keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
-            self._standing.set(*_joined([*(self._shifted(self._tiles[key]) for key in keys), self._fenced]))
+            self._standing.set(*_joined([self._shifted(self._tiles[key]) for key in keys]))
             tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
             for layer in (self._ground, self._walls):
                 layer.show("still", tiles)
@@ -220,7 +224,9 @@ class GlScene:
         z = self._surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, (barrier.thickness_m, barrier.length_m))
         red, white = props.barrier_meshes(barrier)
         size = (barrier.length_m, barrier.height_m, barrier.thickness_m)
-        form = self._forms.id(("barrier", *size), lambda: [Part(red, props.PROP_RED), Part(white, props.PROP_WHITE)])
+        form = self._fence_forms.id(
+            ("barrier", *size), lambda: [Part(red, props.PROP_RED), Part(white, props.PROP_WHITE)]
+        )
         rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
         return np.array([form]), rows
 

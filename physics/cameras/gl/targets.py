@@ -6,6 +6,7 @@ Colour and label share one texture (the label is its fourth channel), so that a 
 from __future__ import annotations
 
 from collections import deque
+from functools import lru_cache
 from typing import Final
 
 import cv2
@@ -14,18 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
+from physics.cameras.gl.context import is_card
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
 
 class Target:
-    """A framebuffer of one size. size: width, height in pixels."""
+    """A framebuffer of one size. size: width, height in pixels. parts_on_card: whether colours and labels are parted
+    before they are read, which costs a graphics card nothing; by default where there is one."""
 
-    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
+    def __init__(self, context: moderngl.Context, size: tuple[int, int], parts_on_card: bool | None = None) -> None:
         self.size = size
-        self._colour = context.renderbuffer(size, 4, dtype="f1")
+        self._colour = context.texture(size, 4)
         self._depth = context.depth_renderbuffer(size)
         self.frame, self._painted = (context.framebuffer([self._colour], self._depth) for _ in range(2))
         self._painted.color_mask, self._painted.depth_mask = (True, True, True, False), False
+        on_card = is_card(context) if parts_on_card is None else parts_on_card
+        self._parting = _Parting(context, size) if on_card else None
 
     def clear(self) -> None:
         """Nothing is seen, anywhere."""
@@ -42,7 +47,30 @@ class Target:
 
     def read(self) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
         """Colours (H, W, 3) and labels (H, W), the top row first."""
-        return parted(self.frame.read(components=4, dtype="f1"), self.size)
+        data = np.empty(4 * self.size[0] * self.size[1], dtype=np.uint8)
+        self._read().read_into(data, components=4, dtype="f1")
+        return self.parted(data)
+
+    def copy(self, buffer: moderngl.Buffer, offset: int) -> None:
+        """Let it be copied to a place in a buffer, for `parted`, when the card comes to it."""
+        self._read().read_into(buffer, components=4, dtype="f1", write_offset=offset)
+
+    def parted(self, data: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Colours (H, W, 3) and labels (H, W) of a picture as it was read."""
+        width, height = self.size
+        if self._parting is not None:
+            colours, labels = data[: 3 * width * height], data[3 * width * height :]
+            return colours.reshape(height, width, 3), labels.reshape(height, width)
+        whole = data.reshape(height, width, 4)
+        rgb, label = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), cv2.extractChannel(whole, 3)
+        return np.asarray(rgb, dtype=np.uint8), np.asarray(label, dtype=np.uint8)
+
+    def _read(self) -> moderngl.Framebuffer:
+        """What is to be read of it."""
+        if self._parting is None:
+            return self.frame
+        self._parting.draw(self._colour)
+        return self._parting.frame
 
     def read_depth(self) -> NDArray[np.float32]:
         """Depth along the view, (H, W) metres."""
@@ -52,20 +80,65 @@ class Target:
         return (FAR_PLANE_M * NEAR_PLANE_M / (FAR_PLANE_M - (FAR_PLANE_M - NEAR_PLANE_M) * depth)).astype(np.float32)
 
     def release(self) -> None:
-        for thing in (self.frame, self._painted, self._colour, self._depth):
+        for thing in (self.frame, self._painted, self._colour, self._depth, self._parting):
+            if thing is not None:
+                thing.release()
+
+
+class _Parting:
+    """Draws a picture's bytes anew in another order: all colours, then all labels."""
+
+    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
+        self._context = context
+        self._bytes = context.renderbuffer(size, 4, dtype="f1")
+        self.frame = context.framebuffer([self._bytes])
+        self._everywhere = context.vertex_array(_parting_program(context), [])
+
+    def draw(self, picture: moderngl.Texture) -> None:
+        self.frame.use()
+        self._context.enable_only(moderngl.NOTHING)
+        picture.use(0)
+        self._everywhere.render(moderngl.TRIANGLES, vertices=3)
+        self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+
+    def release(self) -> None:
+        for thing in (self._everywhere, self.frame, self._bytes):
             thing.release()
+
+
+@lru_cache(maxsize=1)
+def _parting_program(context: moderngl.Context) -> moderngl.Program:
+    return context.program(
+        vertex_shader="""#version 430
+        void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
+        """,
+        fragment_shader="""#version 430
+        layout(binding = 0) uniform sampler2D picture;
+        out vec4 four;
+        float byte_at(int k, ivec2 size) {
+            int colours = 3 * size.x * size.y;
+            int at = k < colours ? k / 3 : k - colours;
+            return texelFetch(picture, ivec2(at % size.x, at / size.x), 0)[k < colours ? k - 3 * at : 3];
+        }
+        void main() {
+            ivec2 size = textureSize(picture, 0), here = ivec2(gl_FragCoord.xy);
+            int k = 4 * (here.y * size.x + here.x);
+            four = vec4(byte_at(k, size), byte_at(k + 1, size), byte_at(k + 2, size), byte_at(k + 3, size));
+        }
+        """,
+    )
 
 
 class Readback:
     """Pictures on their way from the graphics card: copied behind one another into a buffer when the card comes to it,
-    fetched later, so that nobody waits for one while the next can be drawn. size: width, height of a picture."""
+    fetched later, so that nobody waits for one while the next can be drawn. target: what they are drawn into."""
 
     UNDER_WAY: Final = 2
     """Buffers that may have begun and not ended."""
 
-    def __init__(self, context: moderngl.Context, size: tuple[int, int]) -> None:
-        self._context, self._size = context, size
-        self._each = size[0] * size[1] * 4
+    def __init__(self, context: moderngl.Context, target: Target) -> None:
+        self._context, self._target = context, target
+        self._each = target.size[0] * target.size[1] * 4
         self._free = [context.buffer(reserve=self._each) for _ in range(self.UNDER_WAY)]
         self._begun: deque[tuple[moderngl.Buffer, int]] = deque()
 
@@ -79,9 +152,9 @@ class Readback:
             buffer = self._context.buffer(reserve=pictures * self._each)
         self._begun.append((buffer, pictures))
 
-    def copy(self, target: Target, place: int = 0) -> None:
-        """Let the card copy a target to a place in the buffer that began last."""
-        target.frame.read_into(self._begun[-1][0], components=4, dtype="f1", write_offset=place * self._each)
+    def copy(self, place: int = 0) -> None:
+        """Let the card copy the target to a place in the buffer that began last."""
+        self._target.copy(self._begun[-1][0], place * self._each)
 
     def forget(self) -> None:
         """Give the buffer that began last back: its pictures could not be drawn."""
@@ -93,17 +166,11 @@ class Readback:
             raise EngineError("no picture is under way: `begin` one first")
         buffer, pictures = self._begun.popleft()
         self._free.append(buffer)
-        data = memoryview(buffer.read(pictures * self._each)) if pictures else memoryview(b"")
-        return [parted(data[i * self._each : (i + 1) * self._each], self._size) for i in range(pictures)]
+        data = np.empty((pictures, self._each), dtype=np.uint8)
+        if pictures:
+            buffer.read_into(data, data.nbytes)
+        return [self._target.parted(one) for one in data]
 
     def release(self) -> None:
         for buffer in (*self._free, *(buffer for buffer, _ in self._begun)):
             buffer.release()
-
-
-def parted(data: bytes | memoryview, size: tuple[int, int]) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-    """Colours (H, W, 3) and labels (H, W) of a picture as it was read."""
-    width, height = size
-    whole = np.frombuffer(data, dtype=np.uint8).reshape(height, width, 4)
-    colours, labels = cv2.cvtColor(whole, cv2.COLOR_RGBA2RGB), cv2.extractChannel(whole, 3)
-    return np.asarray(colours, dtype=np.uint8), np.asarray(labels, dtype=np.uint8)
