@@ -87,6 +87,7 @@ class WalkGraph:
             for port in corner.ports
         }
         self._arcs = lru_cache(maxsize=8)(self._arcs_without)
+        self._onward = lru_cache(maxsize=4096)(self._choices)
 
     @cached_property
     def component(self) -> NDArray[np.int32]:
@@ -142,10 +143,9 @@ class WalkGraph:
         walk = [strip]
         port = Port(strip, 1 if forward else 0)
         while len(walk) < n_edges:
-            choices = [p for p in self.others(port, closed) if self.others(p.other, closed)]
+            choices, weights = self._onward(port, closed)
             if not choices:
                 break
-            weights = [CROSSING_WEIGHT if strips[p.strip].kind == "crossing" else 1.0 for p in choices]
             pick = rng.random() * sum(weights)
             chosen = choices[-1]
             for choice, weight in zip(choices, weights, strict=True):
@@ -158,6 +158,12 @@ class WalkGraph:
         while len(walk) > 1 and strips[walk[-1]].kind == "crossing":
             walk.pop()
         return walk
+
+    def _choices(self, port: Port, closed: frozenset[Port]) -> tuple[tuple[Port, ...], tuple[float, ...]]:
+        """Where a wanderer at a port may go on that is no dead end, and how likely."""
+        choices = tuple([p for p in self.others(port, closed) if self.others(p.other, closed)])
+        kinds = [self.street_map.strips[p.strip].kind for p in choices]
+        return choices, tuple([CROSSING_WEIGHT if kind == "crossing" else 1.0 for kind in kinds])
 
     @cached_property
     def _along(self) -> tuple[NDArray[np.int32], NDArray[np.int32], Floats]:

@@ -153,7 +153,7 @@ class Pedestrians:
     def _enter(self, count: int, x_m: float, y_m: float, low_m: float, seen: Mapping[str, Seen]) -> None:
         if count <= 0 or not (ring := self._spots.ring(x_m, y_m, low_m, self._spec.radius_m)):
             return
-        taken = [(p.x_m, p.y_m) for p in seen.values()]
+        taken = np.array([(p.x_m, p.y_m) for p in seen.values()], dtype=float).reshape(-1, 2)
         for _ in range(4 * count):
             group = self._groups.coming
             if 2 * count < group.size:
@@ -165,9 +165,8 @@ class Pedestrians:
             middle_m = float(self._rng.uniform(-half_m, half_m))
             back = -1.0 if forward else 1.0
             places = [spot.beside(middle_m + left_m, back * row_m) for left_m, row_m in group.places(width_m)]
-            if any(
-                np.hypot(x - other_x, y - other_y) < _PERSONAL_SPACE_M for x, y in places for other_x, other_y in taken
-            ):
+            gap = np.array(places)[:, None] - taken
+            if (np.hypot(gap[..., 0], gap[..., 1]) < _PERSONAL_SPACE_M).any():
                 continue
             walk = self._graph.wander(self._rng, spot.edge, forward, _WALK_EDGES, self._closed)
             if len(walk) == 1:
@@ -178,7 +177,7 @@ class Pedestrians:
                 self._add(name, spot, walk, speed_mps, xy)
             self._together.join(names, speed_mps, walk)
             self._groups.entered()
-            taken += places
+            taken = np.concatenate([taken, places])
             count -= group.size
             if count <= 0:
                 return

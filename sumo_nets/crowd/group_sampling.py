@@ -9,6 +9,7 @@ walk 1.16 m/s on the mean, 0.92 m/s at the 15th percentile, and children with ad
 
 from __future__ import annotations
 
+from bisect import bisect
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -34,6 +35,9 @@ ROW_M: Final = 0.8
 
 CHILDREN_SHARE, ELDERLY_SHARE = 0.10, 0.12
 """Of those whose ages nobody asked for."""
+
+_ANY_AGES: Final = (1.0 - CHILDREN_SHARE - ELDERLY_SHARE, 1.0 - ELDERLY_SHARE)
+"""Up to where draws from 0 to 1 are adults, and children."""
 
 
 class PersonGroup(NamedTuple):
@@ -99,5 +103,4 @@ class GroupDraws:
 
     def _any_ages(self, size: int) -> tuple[Age, ...]:
         """How old they look where the spec asks for no ages; all walk alike."""
-        shares = [1.0 - CHILDREN_SHARE - ELDERLY_SHARE, CHILDREN_SHARE, ELDERLY_SHARE]
-        return tuple(map(Age, self._rng_ages.choice(3, size, p=shares).tolist()))
+        return tuple([Age(bisect(_ANY_AGES, draw)) for draw in self._rng_ages.random(size).tolist()])
