@@ -13,7 +13,7 @@ from functools import lru_cache
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.rows import RowLookup
@@ -29,6 +29,9 @@ STRIDES_M: Final = (0.45, 0.86, 1.20, 1.48, 1.78, 1.75, 2.15)
 Walking strides grow with the power 0.5 to 0.6 of the pace, as in Grieve and Gear, The relationships between length of
 stride, step frequency, time of swing and speed of walking, Ergonomics 9(5), 1966.
 """
+
+Ages = Sequence[int] | NDArray[np.int8]
+_PACES_MPS, _STRIDES_M = np.array(PACES_MPS), np.array(STRIDES_M)
 
 SETTLE_S: Final = 0.25
 """Time constant with which the shown pace follows the speed: how long a start or a stop takes."""
@@ -63,7 +66,7 @@ def relative_pace(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
 def stride_m(pace_mps: ArrayLike, stature: ArrayLike) -> Floats:
     """(N,) stride in metres of people of (N,) statures at (N,) paces."""
     scale = np.asarray(stature, dtype=float) / REFERENCE_M
-    return np.asarray(scale * np.interp(relative_pace(pace_mps, stature), PACES_MPS, STRIDES_M))
+    return np.asarray(scale * np.interp(relative_pace(pace_mps, stature), _PACES_MPS, _STRIDES_M))
 
 
 @dataclass(slots=True)
@@ -72,24 +75,28 @@ class Strides:
 
     period_s: float
     _rows: RowLookup = field(default_factory=RowLookup)
-    _table: Floats = field(default_factory=lambda: np.zeros((1, 5)))
+    _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    _strides: Floats = field(default_factory=lambda: np.zeros(1))
+    _pace: Floats = field(default_factory=lambda: np.zeros(1))
+    _stature: Floats = field(default_factory=lambda: np.zeros(1))
 
-    def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats, age: Sequence[int]) -> tuple[Floats, Floats]:
+    def update(self, ids: tuple[str, ...], xy: Floats, speed: Floats, age: Ages) -> tuple[Floats, Floats]:
         """Strides taken so far (N,) and paces (N,) m/s, given where people (N, 2) are now and their speeds (N,), or the
         paces that those show who tread on the spot. age: of each, an `Age`.
 
         Who is new begins somewhere in a stride, drawn from the name, at the pace of the moment.
         """
-        row, known = self._rows.of(ids)
-        before = self._table[row]
-        for i in np.flatnonzero(~known).tolist():
-            before[i] = (*xy[i], first_stride(ids[i]), speed[i], stature_m(ids[i], age[i]))
-        at, strides, pace, stature = before[:, :2], before[:, 2], before[:, 3], before[:, 4]
+        row, new = self._rows.of(ids)
+        at, strides, pace, stature = self._xy[row], self._strides[row], self._pace[row], self._stature[row]
+        for i in new:
+            at[i], strides[i], pace[i] = xy[i], first_stride(ids[i]), speed[i]
+            stature[i] = stature_m(ids[i], age[i])
         pace = pace + (speed - pace) * min(self.period_s / SETTLE_S, 1.0)
-        moved = np.hypot(xy[:, 0] - at[:, 0], xy[:, 1] - at[:, 1])
+        step = xy - at
+        moved = np.hypot(step[:, 0], step[:, 1])
         if ids:
             strides = strides + np.where(moved < _JUMP_M, moved, 0.0) / stride_m(pace, stature)
-            self._table = np.column_stack([xy, strides, pace, stature])
+            self._xy, self._strides, self._pace, self._stature = xy, strides, pace, stature
         return strides, pace
 
 

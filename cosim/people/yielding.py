@@ -8,7 +8,7 @@ somebody still hits them."""
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ DRAWS_BACK_M = 0.015
 """Who stands nearer to the robot than KEEP_M goes back by this in a step of 0.05 s."""
 
 TOUCH_M = 0.01
+_ROUNDING_M: Final = 1e-6
 FORESEEN_S = 0.6
 """How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
 
@@ -49,16 +50,20 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
     That choice strengthens itself, so nobody dithers. stand (N,): who only wants to stand there comes up as near as it
     can and draws back slowly from a robot that is nearer than KEEP_M: it would go round it and back for ever.
     """
-    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
-    turn = np.array([[cos, -sin], [sin, cos]])
     length, width = body.half_m
     ahead = FORESEEN_S * max(body.v_mps, 0.0)
     low, high = np.array([-length, -width]), np.array([length, width])
     reach = np.array([ahead, 0.0])
-    near = (wanted - body.pose.xy) @ turn
-    if not (_gap(near, low, high + reach) < STEP_ROUND_GAP_M).any():
+    offset = wanted - body.pose.xy
+    if np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf) > within_reach_m(body) + _ROUNDING_M:
         return wanted
-    local = (before - body.pose.xy) @ turn
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    turn = np.array([[cos, -sin], [sin, cos]])
+    everybody = offset @ turn
+    rows = np.flatnonzero(_gap(everybody, low, high + reach) < STEP_ROUND_GAP_M)
+    if not len(rows):
+        return wanted
+    local, near = ((before - body.pose.xy) @ turn)[rows], everybody[rows]
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
@@ -72,13 +77,14 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
     moved = np.where(slides[:, None], local + tangent * (side * pace)[:, None], near)
     if stand is not None:
         back = np.clip(STEP_ROUND_GAP_M + PERSON_RADIUS_M - far, 0.0, DRAWS_BACK_M)
-        comes_up = slides & stand
+        comes_up = slides & stand[rows]
         moved[comes_up] = (near + normal * (inward + back)[:, None])[comes_up]
 
-    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length) & (_gap(near, low, high + reach) < STEP_ROUND_GAP_M)
+    meets = ~slides & (step[:, 0] < 0.0) & (local[:, 0] > length)
     aside = np.where(local[:, 1] >= 0.0, pace, -pace)
     moved[meets] = local[meets] + np.column_stack([np.zeros_like(aside), aside])[meets]
-    rounded: Floats = moved @ turn.T + body.pose.xy
+    everybody[rows] = moved
+    rounded: Floats = everybody @ turn.T + body.pose.xy
     return rounded
 
 

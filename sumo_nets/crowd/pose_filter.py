@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.rows import RowLookup
 from cosim.people.yielding import RobotBody, stepped_round
-from sumo_nets.crowd.separation import kept_apart
+from sumo_nets.crowd.separation import NearPairs, kept_apart
 
 MAX_SPEED_MPS = 2.2
 """The fastest a shown person moves: above every walking speed, so that it catches up."""
@@ -46,6 +46,7 @@ class PoseFilter:
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
     _motion: Floats = field(default_factory=lambda: np.zeros((1, 2)))
+    _near: NearPairs = field(default_factory=NearPairs)
 
     def update(
         self,
@@ -61,12 +62,11 @@ class PoseFilter:
         Who is new is shown as simulated, facing as `facing_of` says; who is missing is forgotten. body: the robot,
         round which people step. others (K, 2) m: people who are moved by somebody else.
         """
-        row, known = self._rows.of(ids)
+        row, new = self._rows.of(ids)
         before, facing, motion = self._xy[row], self._heading[row], self._motion[row]
-        new = np.flatnonzero(~known)
-        if len(new):
+        if new:
             before[new] = xy[new]
-            facing[new] = [facing_of(ids[i]) for i in new.tolist()]
+            facing[new] = [facing_of(ids[i]) for i in new]
             motion[new] = speed[new, None] * np.column_stack([np.cos(facing[new]), np.sin(facing[new])])
         simulated = motion[new]
 
@@ -85,7 +85,8 @@ class PoseFilter:
         moving = np.hypot(motion[:, 0], motion[:, 1]) > TURNING_SPEED_MPS
         aim = np.where(moving, np.arctan2(motion[:, 1], motion[:, 0]), facing)
         turn_rad = MAX_TURN_RADPS * self.period_s
-        facing = wrap_angles(facing + np.clip(wrap_angles(aim - facing), -turn_rad, turn_rad))
+        turn = np.minimum(np.maximum(wrap_angles(aim - facing), -turn_rad), turn_rad)
+        facing = wrap_angles(facing + turn)
 
         if ids:
             self._xy, self._heading, self._motion = shown, facing, motion
@@ -95,4 +96,4 @@ class PoseFilter:
         firm = np.arange(len(shown) + len(others)) >= len(shown)
         stand = np.concatenate([stand, np.zeros(len(others), dtype=bool)])
         before, wanted = np.concatenate([before, others]), np.concatenate([shown, others])
-        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand)[: len(shown)]
+        return kept_apart(before, wanted, firm, MAX_SPEED_MPS * self.period_s, stand, self._near)[: len(shown)]

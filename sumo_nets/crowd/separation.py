@@ -7,6 +7,7 @@ the step bends to the side on which it would pass; that choice strengthens itsel
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -22,6 +23,9 @@ SHOULDERS_M: Final = SHOULDER_TO_SHOULDER_M
 _NEAR_M: Final = 0.6
 """Pairs nearer than this are looked at: some of them come nearer by giving way to others."""
 
+_MARGIN_M: Final = 1.0
+"""Who may come near is looked for so much farther out, and anew when somebody has moved half of it."""
+
 ROUNDS: Final = 8
 """One gives way to several in turn, at most so often."""
 
@@ -35,22 +39,62 @@ BEND: Final = 0.6
 STIRS_M: Final = 0.002
 """Nobody who stands moves in order to get nearer by less."""
 
+Rows = NDArray[np.intp]
 Complex = NDArray[np.complex128]
 """Points of the plane, x + iy in metres: turning and measuring are single operations."""
 
 
+@dataclass(slots=True)
+class NearPairs:
+    """Finds who is near whom, moment by moment, and remembers who may be soon."""
+
+    _at: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
+    _one: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+    _other: Rows = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+
+    def of(self, at: Complex, firm: NDArray[np.bool_]) -> tuple[Rows, Rows]:
+        """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is too near.
+
+        at, firm: (N,) where they are, and who does not give way.
+        """
+        if len(at) != len(self._at) or np.abs(at - self._at).max(initial=0.0) > 0.49 * _MARGIN_M:
+            self._look(at)
+        gap = at[self._one] - at[self._other]
+        far_m2 = gap.real * gap.real + gap.imag * gap.imag
+        close = far_m2 < SHOULDERS_M * SHOULDERS_M
+        if close.any():
+            near = far_m2 <= _NEAR_M * _NEAR_M
+            one, other = self._one[near], self._other[near]
+            moves = ~(firm[one] & firm[other])
+            if (close[near] & moves).any():
+                return one[moves], other[moves]
+        return self._one[:0], self._other[:0]
+
+    def _look(self, at: Complex) -> None:
+        pairs = pairs_within(np.column_stack([at.real, at.imag]), _NEAR_M + _MARGIN_M)
+        self._one, self._other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T.copy()
+        self._at = at
+
+
 def kept_apart(
-    before: Floats, wanted: Floats, firm: NDArray[np.bool_], reach_m: float, stand: NDArray[np.bool_] | None = None
+    before: Floats,
+    wanted: Floats,
+    firm: NDArray[np.bool_],
+    reach_m: float,
+    stand: NDArray[np.bool_] | None = None,
+    near: NearPairs | None = None,
 ) -> Floats:
     """Where people go who want to go from `before` to `wanted`, (N, 2) metres each.
 
     firm (N,): who does not give way. reach_m: the farthest that anybody goes in this step. stand (N,): who wants to
-    stand, and stays where it is rather than go somewhere that is no nearer to where it wants to stand.
+    stand, and stays where it is rather than go somewhere that is no nearer to where it wants to stand. near: what
+    remembers, from step to step, who may come near whom.
     """
-    one, other = _pairs(wanted, firm)
+    goal = _points(wanted)
+    one, other = (near or NearPairs()).of(goal, firm)
     if not len(one):
         return wanted
-    start, goal = _points(before), _points(wanted)
+    start = _points(before)
     share_one = np.where(firm[one], 0.0, np.where(firm[other], 1.0, 0.5))
     shares = share_one, np.where(firm[other], 0.0, np.where(firm[one], 1.0, 0.5))
     apart = start[other] - start[one]
@@ -58,53 +102,41 @@ def kept_apart(
     at = _pushed(goal, one, other, shares, apart, bend)
     if stand is not None and stand.any():
         nowhere = stand & (np.abs(goal - at) > np.abs(goal - start) - STIRS_M)
-        at = _pushed(np.where(nowhere, start, at), one, other, shares, apart, np.ones_like(bend))
+        at = _pushed(np.where(nowhere, start, at), one, other, shares, apart, None)
     step = at - start
     at = np.where(firm, goal, start + step * (reach_m / np.maximum(np.abs(step), reach_m)))
     return np.column_stack([at.real, at.imag])
 
 
 def _pushed(
-    at: Complex,
-    one: NDArray[np.intp],
-    other: NDArray[np.intp],
-    shares: tuple[Floats, Floats],
-    before: Complex,
-    bend: Complex,
+    at: Complex, one: Rows, other: Rows, shares: tuple[Floats, Floats], before: Complex, bend: Complex | None
 ) -> Complex:
     """Where people end up who are at `at` (N,) and give way to each other by `shares` (P,) of what is lacking.
 
-    before (P,): from the first of each pair to the second at the beginning of the step. bend: see `_bend`.
+    before (P,): from the first of each pair to the second at the beginning of the step. bend: see `_bend`; None where
+    nobody turns aside.
     """
     at = at.copy()
     for k in range(ROUNDS):
-        if k == BENDS:
-            bend = np.ones_like(bend)
-        push, most_m = _push(at[other] - at[one], before, bend)
+        apart = at[other] - at[one]
+        far = np.abs(apart)
+        if not (far > 1e-6).all():
+            # Two at one place part along the line on which they came.
+            apart = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
+        lost = np.maximum(SHOULDERS_M - far, 0.0)
+        push = lost * apart / np.abs(apart)
+        if bend is not None and k < BENDS:
+            push = push * bend
         np.add.at(at, other, shares[1] * push)
         np.subtract.at(at, one, shares[0] * push)
-        if most_m < ENOUGH_M:
+        if lost.max() < ENOUGH_M:
             break
     return at
 
 
 def _points(xy: Floats) -> Complex:
-    return np.ascontiguousarray(xy[:, 0] + 1j * xy[:, 1])
-
-
-def _pairs(xy: Floats, firm: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Numbers of those who are near each other, two arrays (P,), in order; none where nobody is too near."""
-    nobody = np.zeros(0, dtype=np.intp)
-    if len(xy) < 2:
-        return nobody, nobody
-    pairs = pairs_within(xy, _NEAR_M)
-    if not len(pairs):
-        return nobody, nobody
-    one, other = pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))].T
-    gap = xy[one] - xy[other]
-    close = (gap * gap).sum(axis=1) < SHOULDERS_M * SHOULDERS_M
-    moves = ~(firm[one] & firm[other])
-    return (one[moves], other[moves]) if (close & moves).any() else (nobody, nobody)
+    points: Complex = np.ascontiguousarray(xy).view(np.complex128)[:, 0]
+    return points
 
 
 def _bend(apart: Complex, step: Complex) -> Complex:
@@ -112,16 +144,3 @@ def _bend(apart: Complex, step: Complex) -> Complex:
     turned = apart.conj() * step
     side = np.where(turned.imag >= 0.0, 1.0, -1.0)
     return np.where(turned.real < 0.0, 1.0 + 1j * BEND * side, 1.0 + 0j)
-
-
-def _push(apart: Complex, before: Complex, bend: Complex) -> tuple[Complex, float]:
-    """(K,) how to move the second of each pair so that it keeps away, and the most that is lacking in metres.
-
-    apart, before: (K,) from the first of each pair to the second, now and at the beginning of the step.
-    """
-    far = np.abs(apart)
-    lost = np.maximum(SHOULDERS_M - far, 0.0)
-    # Two at one place part along the line on which they came.
-    line = np.where(far > 1e-6, apart, np.where(np.abs(before) > 1e-6, before, 1.0 + 0j))
-    push: Complex = lost * line / np.abs(line) * bend
-    return push, float(lost.max(initial=0.0))
