@@ -9,13 +9,17 @@ import importlib.util
 import os
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from itertools import chain, compress
 from typing import Any, Final, NamedTuple, Protocol
 
+import numpy as np
 import sumo as eclipse_sumo  # noqa: F401  sets where SUMO finds its data
 
 from cosim.core.errors import EngineError
+from cosim.core.geometry import Floats
+from cosim.core.state import frozen
 
 
 @contextmanager
@@ -37,10 +41,9 @@ with _unexecuted("libsumo"):  # which would import traci, sumolib and pyproj, no
 
 libsumo: Any = _sumo
 libsumo.simulationStep = libsumo.simulation.step
+_told: Final = libsumo._libsumo
+"""The same without wrappers in Python, for what is asked hundreds of times a tick."""
 
-_EYE: Final = "robot"
-_NOWHERE_M: Final = -1e8
-"""Who has not set out yet is beyond this."""
 _ERRORS: Final = (libsumo.TraCIException, libsumo.FatalTraCIError)
 
 
@@ -48,6 +51,7 @@ class _Persons(Protocol):
     def getIDList(self) -> Sequence[str]: ...
     def getRoadID(self, name: str, /) -> str: ...
     def getNextEdge(self, name: str, /) -> str: ...
+    def getPosition(self, name: str, /) -> tuple[float, float]: ...
     def getLanePosition(self, name: str, /) -> float: ...
     def getSpeed(self, name: str, /) -> float: ...
     def getAngle(self, name: str, /) -> float: ...
@@ -71,6 +75,7 @@ class _Cars(Protocol):
 
 class _Lanes(Protocol):
     def getLength(self, lane: str, /) -> float: ...
+    def getWidth(self, lane: str, /) -> float: ...
     def getShape(self, lane: str, /) -> Sequence[Sequence[float]]: ...
     def getAllowed(self, lane: str, /) -> Sequence[str]: ...
     def getLinks(self, lane: str, /) -> Sequence[tuple[str, bool, bool, bool, str, str, str, float]]: ...
@@ -80,6 +85,7 @@ class _Edges(Protocol):
     def getIDList(self) -> Sequence[str]: ...
     def getFromJunction(self, edge: str, /) -> str: ...
     def getToJunction(self, edge: str, /) -> str: ...
+    def getLaneNumber(self, edge: str, /) -> int: ...
 
 
 class _Phase(Protocol):
@@ -162,51 +168,52 @@ def translated(doing: str) -> Iterator[None]:
         raise EngineError(f"SUMO failed while {doing}: {error}") from error
 
 
-class NearPerson(NamedTuple):
-    """A person near the eye: where, how fast, and the next edge of its walk."""
+class NearPersons(NamedTuple):
+    """N persons, in the order of their names: xy (N, 2) where, mps (N,) how fast, and the next edges of their walks."""
 
-    x_m: float
-    y_m: float
-    mps: float
-    ahead: str
-
-
-class NearVehicle(NamedTuple):
-    """A vehicle near the eye: where its front bumper's middle is, how fast it drives, and its angle."""
-
-    x_m: float
-    y_m: float
-    mps: float
-    angle_deg: float
+    names: tuple[str, ...]
+    xy: Floats
+    mps: Floats
+    ahead: list[str]
 
 
-def open_eye(x_m: float, y_m: float, persons_m: float, vehicles_m: float) -> None:
-    """From now on the persons and vehicles so near to a point are told, by one subscription each."""
-    libsumo.poi.add(_EYE, x_m, y_m, (0, 0, 0, 0))
-    for domain, reach_m, variable in (
-        (libsumo.CMD_GET_PERSON_VARIABLE, persons_m, libsumo.VAR_NEXT_EDGE),
-        (libsumo.CMD_GET_VEHICLE_VARIABLE, vehicles_m, libsumo.VAR_ANGLE),
-    ):
-        libsumo.poi.subscribeContext(_EYE, domain, reach_m, [libsumo.VAR_POSITION, libsumo.VAR_SPEED, variable])
+class NearVehicles(NamedTuple):
+    """N vehicles, in the order of their names: xy (N, 2) where the middles of their front bumpers are, mps (N,) how
+    fast they drive, and their angles (N,)."""
+
+    names: tuple[str, ...]
+    xy: Floats
+    mps: Floats
+    angle_deg: Floats
 
 
-def move_eye(x_m: float, y_m: float) -> None:
-    """The point is there now."""
-    libsumo.poi.setPosition(_EYE, x_m, y_m)
+def persons_near(x_m: float, y_m: float, reach_m: float, crowd: Container[str]) -> NearPersons:
+    """Those of a crowd who have set out and are so near to a point."""
+    of_crowd = [name for name in sorted(libsumo.person.getIDList()) if name in crowd]
+    names, xy = _near(x_m, y_m, reach_m, of_crowd, _told.person_getPosition)
+    return NearPersons(names, xy, _of_each(_told.person_getSpeed, names), [*map(_told.person_getNextEdge, names)])
 
 
-def near_eye() -> tuple[dict[str, NearPerson], dict[str, NearVehicle]]:
-    """Who has set out and is near the point, by name, in the order of the names."""
-    persons, vehicles = {}, {}
-    for name, row in sorted(libsumo.poi.getContextSubscriptionResults(_EYE).items()):
-        x_m, y_m = row[libsumo.VAR_POSITION]
-        if x_m <= _NOWHERE_M:
-            continue
-        if libsumo.VAR_ANGLE in row:
-            vehicles[name] = NearVehicle(x_m, y_m, row[libsumo.VAR_SPEED], row[libsumo.VAR_ANGLE])
-        else:
-            persons[name] = NearPerson(x_m, y_m, row[libsumo.VAR_SPEED], row[libsumo.VAR_NEXT_EDGE])
-    return persons, vehicles
+def vehicles_near(x_m: float, y_m: float, reach_m: float) -> NearVehicles:
+    """The vehicles so near to a point."""
+    names, xy = _near(x_m, y_m, reach_m, sorted(libsumo.vehicle.getIDList()), _told.vehicle_getPosition)
+    speeds, angles = (_of_each(told, names) for told in (_told.vehicle_getSpeed, _told.vehicle_getAngle))
+    return NearVehicles(names, xy, speeds, angles)
+
+
+def _near(
+    x_m: float, y_m: float, reach_m: float, names: Sequence[str], place_of: Callable[[str], tuple[float, float]]
+) -> tuple[tuple[str, ...], Floats]:
+    """Who of these is so near to a point, and where, (N, 2) metres."""
+    xy = np.fromiter(chain.from_iterable(map(place_of, names)), dtype=float).reshape(-1, 2)
+    gap = xy - (x_m, y_m)
+    far_m2 = gap[:, 0] * gap[:, 0] + gap[:, 1] * gap[:, 1]
+    near = np.sqrt(far_m2) <= reach_m
+    return tuple(compress(names, near.tolist())), frozen(xy[near])
+
+
+def _of_each(told: Callable[[str], float], names: Sequence[str]) -> Floats:
+    return np.fromiter(map(told, names), dtype=float, count=len(names))
 
 
 def put_crowd_stopwatch(timed: Callable[[str, Callable[[], None]], Callable[[], None]]) -> None:

@@ -50,8 +50,13 @@ def write_protected(array: Any, dtype: Any = np.float64, shape: tuple[int, ...] 
     copy = np.array(array, dtype=dtype)
     if shape is not None:
         copy = copy.reshape(shape)
-    copy.flags.writeable = False
-    return copy
+    return frozen(copy)
+
+
+def frozen(array: NDArray[Any]) -> NDArray[Any]:
+    """The array itself, write-protected from now on."""
+    array.flags.writeable = False
+    return array
 
 
 @dataclass(frozen=True, slots=True)

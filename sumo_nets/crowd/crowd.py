@@ -6,7 +6,7 @@ robot and the event pedestrians are mirrored in as proxies, so the crowd evades 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from itertools import count
 from pathlib import Path
 from types import TracebackType
@@ -15,8 +15,19 @@ from typing import ClassVar, Self
 import numpy as np
 
 from cosim.core.errors import EngineError
-from cosim.core.geometry import Floats, Pose, headings_from_sumo
-from cosim.core.state import People, PersonKind, RobotState, Street, Vehicles
+from cosim.core.geometry import Pose, headings_from_sumo
+from cosim.core.state import (
+    NO_VEHICLES,
+    Age,
+    Doing,
+    People,
+    PersonKind,
+    RobotState,
+    Street,
+    Vehicles,
+    frozen,
+    write_protected,
+)
 from cosim.episode.ports import Crowd
 from cosim.people.gait import Strides
 from cosim.people.yielding import RobotBody
@@ -33,7 +44,7 @@ from sumo_nets.crowd.lights import Signals
 from sumo_nets.crowd.pose_filter import PERSON_STANDS_MPS, PoseFilter
 from sumo_nets.crowd.proxy import Proxy, Walks
 from sumo_nets.crowd.waiting_spots import Kerbs
-from sumo_nets.engine import NearPerson, NearVehicle, sumo, translated
+from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
 
 TICK_MS = 50
 """One step of SUMO."""
@@ -127,7 +138,6 @@ class SumoCrowd(Crowd):
         tick = self.street.tick
         with translated(f"stepping from tick {tick}"):
             x_m, y_m = robot.pose[:2]
-            engine.move_eye(x_m, y_m)
             if tick % _ROLL_TICKS == 0:
                 persons, vehicles = self._found
                 self._pedestrians.roll(x_m, y_m, _seen(sumo.person.getWaitingTime, persons), self._waits_at_red)
@@ -166,7 +176,8 @@ class SumoCrowd(Crowd):
         self._actors: dict[str, Proxy] = {}
         self._poses = PoseFilter(TICK_MS / 1000)
         self._strides = Strides(TICK_MS / 1000)
-        engine.open_eye(x_m, y_m, self._spec.radius_m + LINGER_M, VEHICLE_REACH_M)
+        self._cast: tuple[tuple[str, ...], list[tuple[str, PersonKind, Age]]] | None = None
+        self._sized = NO_VEHICLES.ids, NO_VEHICLES.size
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
             for _ in range(round(_WARM_UP_S * 1000 / TICK_MS)):
@@ -198,61 +209,63 @@ class SumoCrowd(Crowd):
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
     def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: RobotBody | None) -> Street:
-        walking, vehicles = engine.near_eye()
-        persons = {name: one for name, one in walking.items() if name in self._pedestrians.ages}
-        self._found = persons, vehicles
+        persons = engine.persons_near(x_m, y_m, self._spec.radius_m + LINGER_M, self._pedestrians.ages)
+        self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
         people = self._people(persons, actors, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
-    def _people(self, persons: dict[str, NearPerson], actors: tuple[Actor, ...], body: RobotBody | None) -> People:
-        ids = tuple(persons)
-        xy, speed = _places(persons.values()), np.array([one.mps for one in persons.values()], dtype=float)
-        for i, one in enumerate(persons.values()):
-            if self._signals.is_red(one.ahead):
-                xy[i] = self._kerbs.behind(one.ahead, one.x_m, one.y_m)
+    def _people(self, persons: NearPersons, actors: tuple[Actor, ...], body: RobotBody | None) -> People:
+        xy = persons.xy
+        if red := self._signals.red(persons.ahead):
+            xy = xy.copy()
+            xy[red] = self._kerbs.behind([persons.ahead[i] for i in red], xy[red])
         cast = sorted(actors, key=lambda actor: actor.id)
         others = np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)
-        xy, heading, speed = self._poses.update(ids, xy, speed, _facing, body, others)
-        names = (*ids, *(a.id for a in cast))
+        xy, heading, speed = self._poses.update(persons.names, xy, persons.mps, _facing, body, others)
+        if (persons.names, cast_of := [(a.id, a.kind, a.age) for a in cast]) != self._cast:
+            self._cast = persons.names, cast_of
+            self._names = (*persons.names, *(a.id for a in cast))
+            ages = [*(self._pedestrians.ages[name] for name in persons.names), *(a.age for a in cast)]
+            kinds = [*[PersonKind.CROWD] * len(xy), *(a.kind for a in cast)]
+            self._kind, self._age = write_protected(kinds, np.int8), write_protected(ages, np.int8)
+        doing: list[Doing] = ["walk" if walks else "stand" for walks in (speed > PERSON_STANDS_MPS).tolist()]
         places = np.concatenate([xy, others])
-        speeds = np.concatenate([speed, [a.speed_mps for a in cast]])
         paces = np.concatenate([speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]])
-        ages = [*(self._pedestrians.ages[name] for name in ids), *(a.age for a in cast)]
-        return People.of(
-            names,
-            places,
-            np.concatenate([heading, [a.heading_rad for a in cast]]),
-            speeds,
-            (*("walk" if fast else "stand" for fast in (speed > PERSON_STANDS_MPS).tolist()), *(a.doing for a in cast)),
-            *self._strides.update(names, places, paces, ages),
-            [*[PersonKind.CROWD] * len(ids), *(a.kind for a in cast)],
-            ages,
+        strides, paces = self._strides.update(self._names, places, paces, self._age)
+        return People(
+            self._names,
+            frozen(places),
+            frozen(np.concatenate([heading, [a.heading_rad for a in cast]])),
+            frozen(np.concatenate([speed, [a.speed_mps for a in cast]])),
+            (*doing, *(a.doing for a in cast)),
+            frozen(strides),
+            frozen(paces),
+            self._kind,
+            self._age,
         )
 
-    def _vehicles(self, vehicles: dict[str, NearVehicle]) -> Vehicles:
+    def _vehicles(self, near: NearVehicles) -> Vehicles:
         """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""
-        size = np.array([self._drivers.size_m(name) for name in vehicles], dtype=float).reshape(-1, 2)
-        heading = headings_from_sumo(np.array([one.angle_deg for one in vehicles.values()], dtype=float))
-        back = 0.5 * size[:, :1] * np.column_stack([np.cos(heading), np.sin(heading)])
-        xy = _places(vehicles.values()) - back
-        speed = np.array([one.mps for one in vehicles.values()], dtype=float)
-        return Vehicles.of(tuple(vehicles), xy, heading, speed, size)
+        if near.names != self._sized[0]:
+            sizes = [self._drivers.size_m(name) for name in near.names]
+            self._sized = near.names, write_protected(sizes, shape=(len(sizes), 2))
+        size = self._sized[1]
+        heading = headings_from_sumo(near.angle_deg)
+        ahead = np.column_stack([np.cos(heading), np.sin(heading)])
+        xy = near.xy - 0.5 * size[:, :1] * ahead
+        return Vehicles(near.names, frozen(xy), frozen(heading), frozen(near.mps), size)
 
     def _waits_at_red(self, person: str) -> bool:
         return self._signals.is_red(sumo.person.getNextEdge(person))
 
 
-def _seen(waiting_s: Callable[[str], float], found: Mapping[str, NearPerson | NearVehicle]) -> dict[str, Seen]:
-    return {name: Seen(one.x_m, one.y_m, waiting_s(name)) for name, one in found.items()}
+def _seen(waiting_s: Callable[[str], float], near: NearPersons | NearVehicles) -> dict[str, Seen]:
+    here = zip(near.names, near.xy.tolist(), strict=True)
+    return {name: Seen(x_m, y_m, waiting_s(name)) for name, (x_m, y_m) in here}
 
 
 def _facing(person: str) -> float:
     return float(headings_from_sumo(sumo.person.getAngle(person)))
-
-
-def _places(found: Iterable[NearPerson | NearVehicle]) -> Floats:
-    """(N, 2) metres."""
-    return np.array([(one.x_m, one.y_m) for one in found], dtype=float).reshape(-1, 2)
 
 
 def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 import numpy as np
@@ -53,6 +53,11 @@ class Signals:
             walk, change_s = self._state(crossing, now_s)
             signals[crossing] = Signal(walk, None if change_s is None else round(change_s - now_s, 3))
         return MappingProxyType(signals)
+
+    def red(self, crossings: Sequence[str]) -> list[int]:
+        """The places in `crossings` of those that have a signal that forbids walking."""
+        now_s = self._engine.simulation.getTime()
+        return [i for i, one in enumerate(crossings) if one in self._link and not self._state(one, now_s)[0]]
 
     def is_red(self, crossing: str) -> bool:
         """Whether a crossing has a signal and it forbids walking."""

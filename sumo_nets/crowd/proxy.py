@@ -10,13 +10,14 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import shapely
 from shapely.geometry import LineString
 
 from cosim.core.geometry import Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
+from sumo_nets.crowd.sidewalk_lead import SidewalkLead
 from sumo_nets.engine import Sumo
 
 KEEP_ROUTE = 3
@@ -32,6 +33,9 @@ ROUND_THE_CORNER_M = 2.0
 NEARER_M = 0.01
 """By how much the lines of its own place must be nearer to a proxy than those of others."""
 
+_ROUNDING_M: Final = 0.001
+"""Distances hold but for this."""
+
 NUDGES = (0.0, 0.1, 0.2, 0.4, 0.7, 0.98)
 """Shares of the way to its own place's lines by which a proxy is moved to be nearer to them than to others."""
 
@@ -42,6 +46,17 @@ class Walk(NamedTuple):
     around: str
     first: str
     second: str
+
+
+class _Circle(NamedTuple):
+    """What was found at its middle holds all over it."""
+
+    x_m: float = math.nan
+    y_m: float = math.nan
+    radius_m: float = 0.0
+
+    def holds(self, x_m: float, y_m: float) -> bool:
+        return math.hypot(x_m - self.x_m, y_m - self.y_m) <= self.radius_m
 
 
 class Walks:
@@ -58,8 +73,11 @@ class Walks:
         self._into: dict[str, list[str]] = {}
         self._at: dict[str, list[str]] = {}
         self._best: dict[str, Walk | None] = {}
+        self._touches: dict[tuple[Walk, str], int] = {}
+        self._chords: dict[str, tuple[float, float, float, float, float]] = {}
         self._line: Callable[[str], shapely.Geometry] = lambda edge: _line(engine, edge)
-        self._inner = _inner_pieces(engine.edge.getIDList())
+        self._internal = _by_junction(engine.edge.getIDList())
+        self.lead = SidewalkLead(engine, self._internal)
         self._lines: dict[Walk, tuple[shapely.Geometry, shapely.Geometry] | None] = {}
         for strip in street_map.strips.values():
             if strip.kind == "sidewalk":
@@ -117,7 +135,7 @@ class Walks:
 
         None where there are no others.
         """
-        inner = self._inner.get(self._ends[walk.first][1], [])
+        inner = [edge for edge in self._internal.get(self._ends[walk.first][1], []) if _is_walkable(edge)]
         others = [piece for piece in inner if self._place.get(piece) != walk.around]
         if not others:
             return None
@@ -135,12 +153,14 @@ class Walks:
 
     def _touched(self, walk: Walk, edge: str) -> int:
         """How many corners of a corner or crossing the walk's sidewalks touch: SUMO looks for its path there."""
-        strips = self.street_map.strips
-        corners = strips[edge].corners if edge in strips else (edge,)
-        return sum(
-            corner is not None and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
-            for corner in corners
-        )
+        if (walk, edge) not in self._touches:
+            strips = self.street_map.strips
+            corners = strips[edge].corners if edge in strips else (edge,)
+            self._touches[walk, edge] = sum(
+                corner is not None and (corner in strips[walk.first].corners or corner in strips[walk.second].corners)
+                for corner in corners
+            )
+        return self._touches[walk, edge]
 
     def _inside(self, edge: str) -> str:
         """The meeting place of a corner or crossing; the junction of any other edge inside one."""
@@ -156,10 +176,13 @@ class Walks:
         Near the end where the edge ends it is always that one: SUMO may map a proxy there to the walking area, and
         crashes when its walk turns away from it.
         """
-        strip = self.street_map.strips[edge]
-        (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
-        forward = (x1 - x0) * math.cos(pose.heading_rad) + (y1 - y0) * math.sin(pose.heading_rad) >= 0.0
-        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < strip.width_m + ROUND_THE_CORNER_M
+        if edge not in self._chords:
+            strip = self.street_map.strips[edge]
+            (x0, y0), (x1, y1) = strip.line[0].tolist(), strip.line[-1].tolist()
+            self._chords[edge] = x1, y1, x1 - x0, y1 - y0, strip.width_m + ROUND_THE_CORNER_M
+        x1, y1, along_x, along_y, end_m = self._chords[edge]
+        forward = along_x * math.cos(pose.heading_rad) + along_y * math.sin(pose.heading_rad) >= 0.0
+        at_end = math.hypot(pose.x_m - x1, pose.y_m - y1) < end_m
         return self._meeting(edge, 1 if forward or at_end else 0)
 
 
@@ -172,9 +195,11 @@ class Proxy:
         self._base, self._kind, self._serial = base, kind, serial
         self._name: str | None = None
         self._walk: Walk | None = None
-        self._point: tuple[float, float] | None = None
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
+        self._outline: shapely.Geometry | None = None
+        self._inside = self._compared = _Circle()
+        self._leads = False
 
     def update(self, pose: Pose) -> None:
         """Put it at a pose. To be called before every step of the simulation, or it walks on by itself."""
@@ -185,10 +210,9 @@ class Proxy:
             walk = None
         elif walk is None or not self._walks.serves(walk, place.edge, pose):
             walk = self._walks.choose(place.edge, pose)
-        mode = KEEP_ROUTE_ON_ROAD if place.kind == "road" else KEEP_ROUTE
-        at = (x_m, y_m)
-        if walk is not None and mode == KEEP_ROUTE:
-            seen_at = self._walks.seen_at(walk, x_m, y_m)
+        mode, at = KEEP_ROUTE_ON_ROAD, (x_m, y_m)
+        if walk is not None and place.kind != "road" and not self._is_on_sidewalk(walk, place, x_m, y_m):
+            mode, seen_at = KEEP_ROUTE, self._walks.seen_at(walk, x_m, y_m)
             walk, at = (None, at) if seen_at is None else (walk, seen_at)
         if walk != self._walk or self._name is None:
             self.remove()
@@ -210,19 +234,31 @@ class Proxy:
         person.add(self._name, walk.first, lengths[0] / 2, typeID=self._kind)
         person.appendWalkingStage(self._name, [walk.first, walk.second], lengths[1] / 2)
 
+    def _is_on_sidewalk(self, walk: Walk, place: Located, x_m: float, y_m: float) -> bool:
+        """Whether SUMO will take it to be on the sidewalk where its walk begins, whichever lanes it compares."""
+        if place.edge != walk.first or self._inside.radius_m == 0.0:
+            return False
+        if walk != self._walk or not self._compared.holds(x_m, y_m):
+            lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - NEARER_M
+            self._leads, self._compared = lead_m > 0.0, _Circle(x_m, y_m, abs(lead_m) / 2.0)
+        return self._leads
+
     def _locate(self, x_m: float, y_m: float) -> Located:
         """The map's `locate`, asked again only when the body has left the walkable piece where it was."""
-        if self._point == (x_m, y_m):
+        if self._inside.holds(x_m, y_m):
             return self._place
-        self._point = (x_m, y_m)
         if self._piece is None or not shapely.contains_xy(self._piece, x_m, y_m):
             street_map = self._walks.street_map
             self._place = place = street_map.locate(x_m, y_m)
             self._piece = None
             if place.kind == "walk":
                 piece = street_map.strips.get(place.edge) or street_map.corners[place.edge]
-                self._piece = piece.polygon
+                self._piece, self._outline = piece.polygon, shapely.boundary(piece.polygon)
                 shapely.prepare(self._piece)
+        room_m = 0.0
+        if self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m):
+            room_m = max(float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0)
+        self._inside = _Circle(x_m, y_m, room_m)
         return self._place
 
 
@@ -231,13 +267,18 @@ def junction_of(internal: str) -> str:
     return internal[1:].rsplit("_", 1)[0]
 
 
-def _inner_pieces(edges: Iterable[str]) -> dict[str, list[str]]:
-    """Junction -> its walking areas and crossings, those included that are too small for the map."""
-    inner: dict[str, list[str]] = {}
+def _by_junction(edges: Iterable[str]) -> dict[str, list[str]]:
+    """Junction -> the edges inside it, walking areas and crossings included that are too small for the map."""
+    inside: dict[str, list[str]] = {}
     for edge in edges:
-        if edge.startswith(":") and edge.rsplit("_", 1)[1][0] in "wc":
-            inner.setdefault(junction_of(edge), []).append(edge)
-    return inner
+        if edge.startswith(":"):
+            inside.setdefault(junction_of(edge), []).append(edge)
+    return inside
+
+
+def _is_walkable(internal: str) -> bool:
+    """Whether an edge inside a junction is a walking area or crossing."""
+    return internal.rsplit("_", 1)[1][0] in "wc"
 
 
 def _line(engine: Sumo, edge: str) -> shapely.Geometry:
