@@ -1,7 +1,7 @@
 """Zenoh sessions: the one place that imports zenoh.
 
-Queries and replies only, over one explicit endpoint or within one session: no scouting, no shared memory. A handler
-that raises answers with its error instead of silence.
+Over one explicit endpoint, or within one session: no scouting, no shared memory. A handler that raises answers with its
+error instead of silence.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import zenoh
 
 from cosim.core.errors import EngineError
 
 Handler = Callable[[bytes], bytes]
+_Heard = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
 
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """In zenoh's errors: where it was built, of no use to anybody here."""
@@ -49,11 +50,10 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
 class Session:
     """An open Zenoh session. Use as a context manager: a session left open keeps the process alive."""
 
-    def __init__(self, session: zenoh.Session, *, alone: bool = False) -> None:
-        self._session, self._alone = session, alone
+    def __init__(self, session: zenoh.Session) -> None:
+        self._session = session
         self._queryables: list[zenoh.Queryable[None]] = []
-        self._own: list[tuple[zenoh.Queryable[zenoh.Handler[zenoh.Query]], Callable[[zenoh.Query], None]]] = []
-        self._subscribers: list[zenoh.Subscriber[None]] = []
+        self._subscribers: list[zenoh.Subscriber[Any]] = []
 
     @classmethod
     def hub(cls, listen: str) -> Session:
@@ -66,12 +66,6 @@ class Session:
         """A session that connects to a hub; it opens no port of its own."""
         remedy = "Is a process started that listens there, and is the endpoint the same?"
         return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy))
-
-    @classmethod
-    def alone(cls) -> Session:
-        """A session with nobody else in it and no socket. Queries that it serves are answered by the thread that asks:
-        no thread waits for another, and what interrupts the one that asks interrupts the handler."""
-        return cls(_open("peer", [], [], "cannot open a session", "Is the machine out of threads?"), alone=True)
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
@@ -93,15 +87,11 @@ class Session:
                 except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
-        if self._alone:
-            self._own.append((self._session.declare_queryable(key, complete=True), answer))
-        else:
-            self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
+        self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
         """Everybody's replies to one empty query on a key expression, by their keys; errors are left out."""
         replies = self._session.get(key, timeout=timeout_s)
-        self._answer_own()
         return {str(r.ok.key_expr): bytes(r.ok.payload.to_bytes()) for r in replies if r.ok is not None}
 
     def tell(self, key: str, payload: bytes) -> None:
@@ -128,7 +118,6 @@ class Session:
             replies = self._session.get(
                 key, payload=payload, timeout=left_s, consolidation=zenoh.ConsolidationMode.NONE
             )
-            self._answer_own()
             for reply in replies:
                 if reply.ok is not None:
                     return bytes(reply.ok.payload.to_bytes())
@@ -139,21 +128,12 @@ class Session:
             pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
         raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")
 
-    def _answer_own(self) -> None:
-        """Answer what this session has just asked itself."""
-        for held, answer in self._own:
-            while (query := held.try_recv()) is not None:
-                answer(query)
-
     def close(self) -> None:
         """Close the session; closing twice is fine."""
         with suppress(zenoh.ZError):
             for queryable in self._queryables:
                 queryable.undeclare()  # type: ignore[no-untyped-call]
             self._queryables.clear()
-            for held, _ in self._own:
-                held.undeclare()  # type: ignore[no-untyped-call]
-            self._own.clear()
             for subscriber in self._subscribers:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
             self._subscribers.clear()
@@ -166,6 +146,48 @@ class Session:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+class LoneSession(Session):
+    """A session with nobody else in it and no socket: what it asks it answers itself, in the thread that asks.
+
+    Question and answer are publications, not a query: over a query's time watches a thread of Zenoh's, and on a busy
+    machine whoever wakes it waits for a turn of its own. What interrupts the thread that asks interrupts the handler.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_open("peer", [], [], "cannot open a session", "Has this machine threads to spare?"))
+        self._served: list[tuple[_Heard, _Heard, Handler]] = []
+
+    def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
+        """Answer what is asked on `key`, in `ask`."""
+        questions, answers = (self._session.declare_subscriber(heard) for heard in (key, f"{key}/*"))
+        self._subscribers += [questions, answers]
+        self._served.append((questions, answers, handler))
+
+    def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
+        """The answer to one question. Raises TimeoutError at once when nobody serves the key, EngineError when its
+        handler raised."""
+        self._session.put(key, payload)
+        told = None
+        for questions, answers, handler in self._served:
+            while (asked := questions.try_recv()) is not None:
+                self._answer(str(asked.key_expr), handler, asked.payload.to_bytes())
+            while (answer := answers.try_recv()) is not None:
+                told = answer  # the last: one that was interrupted may have left its own
+        if told is None:
+            raise TimeoutError(f"nobody answers on '{key}'")
+        if str(told.key_expr) == f"{key}/error":
+            raise EngineError(f"'{key}' answered: {told.payload.to_string()}")
+        return bytes(told.payload.to_bytes())
+
+    def _answer(self, key: str, handler: Handler, payload: bytes) -> None:
+        try:
+            answer = handler(payload)
+        except Exception as error:  # noqa: BLE001  as over a query
+            self._session.put(f"{key}/error", f"{type(error).__name__}: {error}")
+        else:
+            self._session.put(f"{key}/answer", answer)
 
 
 def _open(mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str) -> zenoh.Session:

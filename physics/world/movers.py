@@ -47,7 +47,7 @@ def movers_near(
     if same:
         away = np.minimum(away, np.hypot(before.xy[:, 0] - x_m, before.xy[:, 1] - y_m))
     found = []
-    for i in np.flatnonzero(away <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).tolist():
+    for i in (away <= reach_m + _ROUNDING_M + (0.0 if same else _JUMP_M)).nonzero()[0].tolist():
         name, was = after.ids[i], None
         if same:
             was = _pose(before, i)

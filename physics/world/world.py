@@ -106,17 +106,17 @@ class BulletWorld:
             bodies.show(kind, movers)
         close: dict[Moving, dict[Mover, TickPoses]] = {kind: {} for kind in near}
         self._lead(near, close, x, y, substeps)
-        trace: list[tuple[float, float, float]] = []
+        trace: list[float] = []
         found: set[Contact] = set()
         for k in range(substeps):
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
                 self._lead(near, close, x, y, substeps)
             pose = bodies.step(k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S))
-            trace.append(pose)
+            trace += pose
             if bodies.watched:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
-        poses = write_protected(trace)
+        poses = write_protected(trace, shape=(substeps, 3))
         for kind, ways in close.items():
             if ways:
                 found.update(self._overlaps(kind, ways, poses))

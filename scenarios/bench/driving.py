@@ -84,7 +84,7 @@ def driving() -> list[Figure]:
             "director, ms a tick",
             drive.ms["bridge"] / drive.ticks,
             _bare_query_ms(),
-            "an empty query, now and then",
+            "an empty question, now and then",
             0.2,
         ),
     ]
@@ -114,13 +114,13 @@ def _factor(name: str, drive: _Drive, reach: float) -> Figure:
 
 
 def _bare_query_ms() -> float:
-    """A query that nothing is done for, asked now and then as in an episode: nothing that Zenoh needs is in a cache."""
+    """A question that nothing is done for, asked now and then as in an episode: nothing that Zenoh needs is in a cache."""
     import numpy as np
 
-    from bridge.session import Session
+    from bridge.session import LoneSession
 
     between, found = np.ones(_BETWEEN), []
-    with Session.alone() as session:
+    with LoneSession() as session:
         session.serve("bench", bytes)
         for _ in range(_QUERIES):
             between += 1.0

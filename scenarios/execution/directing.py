@@ -20,7 +20,7 @@ from typing import Final
 import scenarios.events
 from bridge import keys
 from bridge.director import RemoteDirector, Waiting, serve_director
-from bridge.session import Session
+from bridge.session import LoneSession, Session
 from cosim.core.errors import DirectorLost, EngineError
 from cosim.episode.ports import Director
 from cosim.spec.event_kind import EventKinds
@@ -42,7 +42,7 @@ def director_of(
 def directed(episode: str, kinds: EventKinds = EVENT_KINDS) -> Iterator[Director]:
     """A director of event pedestrians and the simulator's end of it, both in one Zenoh session."""
     key = keys.director("local", keys.chunk(episode))
-    with Session.alone() as session:
+    with LoneSession() as session:
         serve_director(session, key, partial(react, kinds=kinds))
         yield RemoteDirector(session, key)
 

@@ -15,7 +15,7 @@ import pytest
 from bridge import keys
 from bridge.codec import decode, encode
 from bridge.director import RemoteDirector, opened, serve_director, signed
-from bridge.session import Session
+from bridge.session import LoneSession, Session
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
@@ -66,7 +66,7 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
         threads.add(threading.get_ident())
         return echo(asked)
 
-    with Session.alone() as session:
+    with LoneSession() as session:
         serve_director(session, KEY, seen, by="cafe")
         director = RemoteDirector(session, KEY, by="cafe")
         assert [director.react(query(tick)) for tick in range(100)] == [echo(query(tick)) for tick in range(100)]
@@ -86,7 +86,7 @@ def test_ctrl_c_while_the_own_director_answers_is_not_lost() -> None:
             raise raised.pop(0)
         return echo(asked)
 
-    with Session.alone() as session:
+    with LoneSession() as session:
         serve_director(session, KEY, broken)
         director = RemoteDirector(session, KEY)
         with pytest.raises(KeyboardInterrupt):
