@@ -114,7 +114,7 @@ def _factor(name: str, drive: _Drive, reach: float) -> Figure:
 
 
 def _bare_query_ms() -> float:
-    """A question that nothing is done for, asked now and then as in an episode: nothing that Zenoh needs is in a cache."""
+    """A question that nothing is done for, asked now and then as in an episode: what Zenoh needs is in no cache."""
     import numpy as np
 
     from bridge.session import LoneSession
