@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import resource
 import statistics
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple, cast
 
 import msgspec
@@ -79,7 +79,7 @@ def driving() -> list[Figure]:
     drive = _drive(2000.0, FourHertz())
     found = [
         _factor("long-horizon, 96x96 at 4 Hz, simulated s per s", drive, 10.0),
-        Figure("resident memory, MiB", drive.memory_mib, reach=400.0),
+        Figure("memory of a further process, MiB", drive.memory_mib, reach=400.0),
         Figure(
             "director, ms a tick",
             drive.ms["bridge"] / drive.ticks,
@@ -94,6 +94,12 @@ def driving() -> list[Figure]:
         reach = 1.2 if part == "physics" else None
         found.append(Figure(whole, drive.ms[part], inside, _ENGINES.get(part, ""), reach, reach_ratio=True))
     return found
+
+
+def own_memory_mib() -> float:
+    """What this process has written: a further one takes as much. Pages of files are shared, baked ones too."""
+    rows = (row.split() for row in Path("/proc/self/smaps_rollup").read_text().splitlines())
+    return sum(int(words[1]) for words in rows if words[0] == "Private_Dirty:") / 1024.0
 
 
 def driving_large_pictures() -> list[Figure]:
@@ -170,6 +176,6 @@ def _drive(size_m: float, policy: Route) -> _Drive:
         ms={part: seconds * scale for part, seconds in spent.items()},
         engine_ms={part: seconds * scale for part, seconds in engine.items()},
         factor=_MEASURED_S / whole,
-        memory_mib=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        memory_mib=own_memory_mib(),
         ticks=(last - warm) / _MEASURED_S,
     )

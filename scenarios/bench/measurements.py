@@ -15,14 +15,14 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import EngineError, UsageError, unknown
-from scenarios.bench import cameras, driving, episodes, places, starting, street, together
+from scenarios.bench import cameras, driving, episodes, growth, places, starting, street, together
 from scenarios.bench.figures import MORE, Figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ENVIRONMENT: Final = ("driving", "large pictures", "towns", "starting", "street 50", "street 150", "places", "reactive")
 """Taken by `cosim bench`."""
-ON_REQUEST: Final = ("ten environments",)
-"""Taken by `cosim bench` when they are named: they are for a machine of many cores."""
+ON_REQUEST: Final = ("ten environments", "200 episodes")
+"""Taken by `cosim bench` when they are named: for a machine of many cores, and for minutes."""
 _ENGINES: Final = "engines"
 
 
@@ -44,6 +44,7 @@ _TAKEN: Final[Mapping[str, Callable[[], list[Figure]]]] = {
     "places": places.places,
     "reactive": episodes.reactive,
     "ten environments": together.driving_together,
+    "200 episodes": growth.growing,
     **CAMERA,
 }
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
@@ -96,15 +96,21 @@ def staged(
 
             director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = InjectedPeople(director, clock.tick_ms, partial(on_map, street_map), options.injections)
-        footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
-        free = shapely.buffer(footing, -robot.width_m / 2)
-        shapely.prepare(free)
+
+        @cache
+        def free() -> Polygon | MultiPolygon:
+            """Made for those who are told it: props have to be placed along the whole route."""
+            footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
+            room = shapely.buffer(footing, -robot.width_m / 2)
+            shapely.prepare(room)
+            return room
+
         yield StagedScenario(
             parts=Parts(world, crowd, injected, camera),
             robot=robot,
             renderer=renderer,
             scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot.footprint_m, clock),
-            known=partial(known, scenario, free),
+            known=lambda now: known(scenario, free(), now),
             eyes=eyes,
             injected=injected,
             entrances=crowd.entrances,

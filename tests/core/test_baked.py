@@ -114,6 +114,38 @@ def test_a_cache_that_cannot_be_written_is_done_without_and_said_once(
     assert told.startswith("note: ") and "not kept" in told and len(told.splitlines()) == 1
 
 
+def test_a_full_disk_is_done_without_and_nothing_half_written_stays(room: Path, tmp_path: Path) -> None:
+    """Writing that ends in the middle of a file gives the right arrays, one line, and no folder that could be read."""
+    code = (
+        "import pathlib, resource, sys, numpy as np\nfrom cosim.core.baked import baked, sources_hash\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "made = sources_hash(pathlib.Path(sys.argv[1]))\n"
+        "arrays = [baked(name, made, lambda: {'n': np.arange(200000)}) for name in 'ab']\n"
+        "print([int(kept['n'].sum()) for kept in arrays])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(room)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
+    assert done.stdout == f"[{sum(range(200000))}, {sum(range(200000))}]\n", done.stderr
+    assert done.stderr.startswith("note: ") and "not kept" in done.stderr and done.stderr.count("note: ") <= 2
+    assert list((tmp_path / "cache/baked").iterdir()) == []
+
+
+def test_a_cache_that_may_only_be_read_is_read(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """What lies there is mapped, and nothing is said."""
+    make = Maker()
+    baked("a", sources_hash(room), make)
+    folders = [tmp_path / "cache", tmp_path / "cache/baked", *(tmp_path / "cache/baked").iterdir()]
+    for folder in folders:
+        folder.chmod(0o555)
+    try:
+        assert same(baked("a", sources_hash(room), make)) and make.times == 1
+    finally:
+        for folder in folders:
+            folder.chmod(0o755)
+    assert capsys.readouterr().err == ""
+
+
 def test_who_makes_it_at_once_gets_the_same_and_leaves_nothing(room: Path, tmp_path: Path) -> None:
     """Processes that make the same at the same time all get it, also beside what a killed one left half made."""
     left = tmp_path / "cache/baked/.making-of-a-killed-one"

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,6 +18,7 @@ from sumo_nets.city.store import city_net
 from sumo_nets.net import snapshot
 from sumo_nets.net.netfile import read_net
 from sumo_nets.net.snapshot import SNAPSHOT_FOLDER, map_as_bytes, street_map_of, thawed
+from tests.conftest import PATIENCE_S
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +97,26 @@ def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, m
     (tmp_path / "file").write_text("in the way")
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "file"))
     assert map_as_bytes(street_map_of(net)) == map_as_bytes(read_net(net))
+
+
+def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
+    """The map is read all the same, and the next process finds nothing that it could take for one."""
+    code = (
+        "import pathlib, resource, sys\nfrom sumo_nets.net.snapshot import street_map_of\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
+        "print(len(street_map_of(pathlib.Path(sys.argv[1])).strips))"
+    )
+    kept = tmp_path / "full"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(net)],
+        env=os.environ | {"COSIM_CACHE": str(kept)},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE_S,
+        check=False,
+    )
+    assert done.stdout == f"{len(read_net(net).strips)}\n", done.stderr
+    assert list((kept / "read").iterdir()) == []
 
 
 def test_a_missing_net_is_an_error_that_names_it(tmp_path: Path, cache: Path) -> None:
