@@ -51,9 +51,10 @@ def test_an_atlas_holds_the_pictures_of_its_cameras(worlds: list[BulletWorld]) -
     assert not np.array_equal(single[0][0].rgb, single[1][0].rgb)
 
 
-def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld]) -> None:
-    """Whoever else is in it, before, beside or after: an environment of a place, light and robot of its own has the
-    pictures of a camera of its own, in the order asked for, also one that left before its picture was fetched."""
+def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whoever else is in it, before, beside or after, one that cannot be drawn too: an environment of a place, light
+    and robot of its own has the pictures of a camera of its own, in the order asked for, also one that left before its
+    picture was fetched."""
     from physics.cameras.gl.atlas import Atlas
 
     busy = busy_street(camera_city(300.0), 8, 4)
@@ -76,6 +77,9 @@ def test_environments_join_and_leave_an_atlas(worlds: list[BulletWorld]) -> None
             assert _same(one, expected)
         with pytest.raises(UsageError, match=f"environment {first} is not in the atlas; in it are: {second}, {third}"):
             atlas.begin([(first, *asked[3])])
+        with monkeypatch.context() as broken, pytest.raises(ZeroDivisionError):
+            broken.setattr(other.surface, "heights", lambda xy: 1 / 0)
+            atlas.begin([(third, *asked[3]), (second, *asked[3])])
         again = atlas.join(*seats[0])
         assert again not in (first, second, third)
         assert all(map(_same, atlas.render([(k, *asked[3]) for k in (again, third)]), (a[3], c[3])))

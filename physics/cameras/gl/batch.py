@@ -62,7 +62,8 @@ class BatchDrawing:
 
     def __init__(self, context: moderngl.Context) -> None:
         self._context = context
-        self.forms = Forms(context, surfaces(context))
+        self._surfaces = surfaces(context)
+        self.forms = Forms(context, self._surfaces)
         self._crowd, self._traffic = CrowdDrawing(context), TrafficDrawing(context, self.forms)
         self._blocks = SceneBlocks(context)
 
@@ -72,6 +73,7 @@ class BatchDrawing:
         for few in _batches(pictures):
             self._cast(few, self._arrange(few))
             self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
+            self._surfaces.bind()
             self._context.front_face = "cw"  # pictures are drawn upside down, to be read top first
             for i, picture in enumerate(few):
                 target.clear()

@@ -110,7 +110,8 @@ class CrowdDrawing:
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
-        """Hold these people as the pictures will show them, each on the ground; binds a framebuffer."""
+        """Hold these people as the pictures will show them, each on the ground; binds a framebuffer, and units 0 and 1
+        until all is drawn."""
         counts = [len(one.people) for one in watched]
         self._split = [[0, 0, 0, 0]] * len(watched)
         if not sum(counts):
@@ -154,6 +155,8 @@ class CrowdDrawing:
         self._baked.use(0)
         self._told.use(1)
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
+        self._matrices.use(0)
+        self._dyed.use(1)
 
     def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
         """Draw those of a picture; in the shadow maps of what moves everybody has few triangles. shadows: whether they
@@ -161,8 +164,6 @@ class CrowdDrawing:
         near, far, cast, end = self._split[picture]
         if stage == "still" or near == end:
             return
-        self._matrices.use(0)
-        self._dyed.use(1)
         held = self._instances, self._commands
         if stage == "moving":
             self._far.draw(stage, shadows, *held, end - cast, cast)

@@ -110,8 +110,6 @@ class GlScene:
         """Draw what was arranged: the small first, then walls and ground from near to far."""
         if stage == "moving":
             return
-        if stage == "colour":
-            self._surfaces.bind()
         (self._seen if stage == "colour" else self._standing).draw(stage, self._shadows)
         self._fenced.draw(stage, self._shadows)
         self._walls.draw(stage)

@@ -31,7 +31,7 @@ The uniform block `Scene` (binding SCENE_BINDING, one for each pass of each pict
 
 Textures: the shadow maps are bound to units STILL_UNIT (what stands) and MOVING_UNIT (what walks and drives), SKY_UNIT
 holds the sky, SURFACES_UNIT, FACADES_UNIT and FINISH_UNIT the textures of ground and walls; free for drawables are
-units 0 and 1.
+units 0 and 1, which people take for the time of a batch.
 
 A drawable takes part in a pass by a method `draw(stage)`, drawing itself with its program of that stage: "colour";
 "still", the shadows of what stands, drawn anew only when the eye has moved on; "moving", the shadows of what moves,

@@ -24,8 +24,8 @@ STEP_M: Final = 8.0
 _DEEP_M: Final = 80.0
 _STILL_PX: Final = 2048
 _MOVING_PX: Final = 512
-_SMALL_PX: Final = 160
-"""Pictures that are not higher show no difference between maps of these sizes and of half of them."""
+_SMALL_PX: Final = (300, 160)
+"""Pictures that are not higher show no difference between the still map, the moving one, and one of half the size."""
 TO_TEXTURE: Final = np.array([[0.5, 0.0, 0.0, 0.5], [0.0, 0.5, 0.0, 0.5], [0.0, 0.0, 0.5, 0.5], [0.0, 0.0, 0.0, 1.0]])
 """From clip space to the space of a texture."""
 
@@ -66,9 +66,11 @@ class ShadowMaps:
 
     def __init__(self, context: moderngl.Context, high_px: int) -> None:
         self._context = context
-        share = 2 if high_px <= _SMALL_PX else 1
-        self._side_px = _STILL_PX // share
-        self._still, self._moving = self._texture(self._side_px), self._texture(_MOVING_PX // share)
+        self._side_px, moving_px = (
+            px // 2 if high_px <= small_px else px
+            for px, small_px in zip((_STILL_PX, _MOVING_PX), _SMALL_PX, strict=True)
+        )
+        self._still, self._moving = self._texture(self._side_px), self._texture(moving_px)
         self._frames = {
             "still": context.framebuffer(depth_attachment=self._still),
             "moving": context.framebuffer(depth_attachment=self._moving),

@@ -18,6 +18,9 @@ from cosim.core.errors import EngineError
 from physics.cameras.gl.context import is_card
 from physics.cameras.view import FAR_PLANE_M, NEAR_PLANE_M
 
+_UNIT: Final = 8
+"""Of the texture that is parted."""
+
 
 class Target:
     """A framebuffer of one size. size: width, height in pixels. parts_on_card: whether colours and labels are parted
@@ -97,7 +100,7 @@ class _Parting:
     def draw(self, picture: moderngl.Texture) -> None:
         self.frame.use()
         self._context.enable_only(moderngl.NOTHING)
-        picture.use(0)
+        picture.use(_UNIT)
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
         self._context.enable_only(moderngl.DEPTH_TEST | moderngl.CULL_FACE)
 
@@ -113,7 +116,7 @@ def _parting_program(context: moderngl.Context) -> moderngl.Program:
         void main() { gl_Position = vec4(gl_VertexID == 2 ? 3.0 : -1.0, gl_VertexID == 1 ? 3.0 : -1.0, 0.0, 1.0); }
         """,
         fragment_shader="""#version 430
-        layout(binding = 0) uniform sampler2D picture;
+        layout(binding = 8) uniform sampler2D picture;
         out vec4 four;
         float byte_at(int k, ivec2 size) {
             int colours = 3 * size.x * size.y;
