@@ -113,10 +113,13 @@ def check_size(width: int, height: int, fov_deg: float) -> None:
 def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotState) -> Shot:
     """What a robot's camera looks at from its mount; it leans with the ground."""
     turn, mount = _attitude(surface, model, robot), spec.on(model)
-    eye = np.array([robot.pose.x_m, robot.pose.y_m, robot.z_m]) + turn @ np.array(mount.at_m)
+    x, y, z = mount.at_m
     down = math.radians(mount.pitch_down_deg)
-    ahead = turn @ np.array([math.cos(down), 0.0, -math.sin(down)])
-    return Shot(eye, eye + ahead, (spec.width, spec.height), spec.fov_deg)
+    ahead, below = math.cos(down), math.sin(down)
+    foot = robot.pose.x_m, robot.pose.y_m, robot.z_m
+    eye = np.array([at + a * x + b * y + c * z for at, (a, b, c) in zip(foot, turn, strict=True)])
+    way = np.array([a * ahead - c * below for a, _, c in turn])
+    return Shot(eye, eye + way, (spec.width, spec.height), spec.fov_deg)
 
 
 def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: float) -> Shot:
@@ -124,12 +127,13 @@ def shot(eye_m: ArrayLike, target_m: ArrayLike, size: tuple[int, int], fov_deg: 
     return Shot(np.asarray(eye_m, dtype=float), np.asarray(target_m, dtype=float), size, fov_deg)
 
 
-def _attitude(surface: Surface, model: Robot, robot: RobotState) -> Floats:
-    """(3, 3) rotation from the base frame to the world: heading, and the slope of the surface."""
+def _attitude(surface: Surface, model: Robot, robot: RobotState) -> tuple[tuple[float, float, float], ...]:
+    """Rows of the rotation from the base frame to the world: heading, and the slope of the surface."""
     _, roll, pitch = surface.lean(robot.pose, model.drive.span_m)
     cz, sz = math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)
     cy, sy, cx, sx = math.cos(pitch), math.sin(pitch), math.cos(roll), math.sin(roll)
-    yaw = np.array([[cz, -sz, 0.0], [sz, cz, 0.0], [0.0, 0.0, 1.0]])
-    tilt = np.array([[cy, 0.0, sy], [0.0, 1.0, 0.0], [-sy, 0.0, cy]])
-    lean = np.array([[1.0, 0.0, 0.0], [0.0, cx, -sx], [0.0, sx, cx]])
-    return np.asarray(yaw @ tilt @ lean)
+    return (
+        (cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx),
+        (sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx),
+        (-sy, cy * sx, cy * cx),
+    )

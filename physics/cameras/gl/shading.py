@@ -169,19 +169,20 @@ def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: boo
 
 def anchor_of(eye_m: Floats) -> Floats:
     """(2,) the point of the anchors' lattice nearest to an eye."""
-    return np.round(np.asarray(eye_m[:2]) / ANCHOR_M) * ANCHOR_M
+    return np.array([round(eye_m[0] / ANCHOR_M), round(eye_m[1] / ANCHOR_M)]) * ANCHOR_M
 
 
 def camera_matrix(shot: Shot, anchor: Floats) -> Floats:
     """(4, 4) from metres relative to the anchor to clip space, the first row of the picture below (read top first)."""
     wide, tall = shot.half_picture
     far, near = FAR_PLANE_M, NEAR_PLANE_M
+    eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
     matrix = np.empty((4, 4))
     matrix[:3, :3] = shot.axes
-    matrix[3, :3] = matrix[2, :3]
-    matrix[:3, :3] *= ((1.0 / wide,), (-1.0 / tall,), ((far + near) / (far - near),))
-    eye = shot.eye_m - (float(anchor[0]), float(anchor[1]), 0.0)
-    matrix[:, 3] = -matrix[:, :3] @ eye
+    matrix[:3, 3] = shot.axes @ -eye
+    matrix[3] = matrix[2]
+    deep = (far + near) / (far - near)
+    matrix[:3] *= ((1.0 / wide,), (-1.0 / tall,), (deep,))
     matrix[2, 3] -= 2.0 * far * near / (far - near)
     return matrix
 
