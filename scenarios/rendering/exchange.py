@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from cosim.core.state import People, RobotState, Signal, Street, Vehicles
+from cosim.core.state import People, RobotState, Signal, Street, Vehicles, write_protected
 from cosim.spec.scenario import Scenario
 from scenarios.execution.messages import Hello
 
@@ -110,7 +110,7 @@ def _in_bytes(value: object) -> object:
 def _array(kind: type, packed: Any) -> Any:
     """A write-protected array."""
     dtype, shape, data = packed
-    return np.frombuffer(data, dtype).reshape(shape)
+    return write_protected(np.frombuffer(data, dtype).reshape(shape), dtype)
 
 
 _encode = msgspec.msgpack.Encoder(enc_hook=_in_bytes).encode

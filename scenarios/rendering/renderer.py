@@ -110,10 +110,12 @@ class _Environment:
         return "" if self.scenario is None else self.scenario.id
 
     def reply(self, reply: Reply) -> None:
-        """Let it go on. One that has ended does not hear it: reading from it tells."""
+        """Let it go on. One that has ended does not hear it: reading from it tells. One that cannot be told any more,
+        because the policy has closed what is not its own, is left as one that the policy is asked for."""
         self.wants = None
         with suppress(OSError):
             self.wire.post(encode_exchange(reply))
+            self.memory.asked = False
 
     def close(self) -> None:
         self.wire.close()
@@ -260,7 +262,6 @@ class _Renderer:
             one.reply(Fine())
         except PolicyError as error:
             one.reply(Refused(str(error), by_policy=True))
-        one.memory.asked = False
 
     def _act(self, which: list[_Environment]) -> None:
         """Ask the policy for these, together."""
@@ -274,8 +275,6 @@ class _Renderer:
                 one.reply(Refused(str(answer), by_policy=True))
             else:
                 one.reply(Told(answer.v_mps, answer.w_radps))
-        for one in which:
-            one.memory.asked = False
 
     def _observed(self, one: _Environment) -> Observation:
         """What the policy is given for an environment."""

@@ -71,6 +71,8 @@ class Knowing:
                 time.sleep(3600)
             if self.now(observation, "exits"):
                 os._exit(7)
+            if self.now(observation, "closes"):
+                os.closerange(3, 1024)
         return answers
 
     def now(self, observation: Observation, name: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import signal
 import time
@@ -17,7 +18,7 @@ import shapely
 
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.geometry import Pose
-from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Street
+from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
@@ -30,7 +31,20 @@ from scenarios.execution import suite_run
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.places import place
-from scenarios.rendering.exchange import Ask, Begin, Draw, Enter, Fine, Knowledge, Refused, Reply, Request, Told
+from scenarios.rendering.exchange import (
+    Ask,
+    Begin,
+    Draw,
+    Enter,
+    Fine,
+    Knowledge,
+    Refused,
+    Reply,
+    Request,
+    Told,
+    decode_request,
+    encode_exchange,
+)
 from scenarios.rendering.link import RendererLink
 from scenarios.rendering.memory import PictureMemory
 from scenarios.rendering.shared import End, SharedRenderer, check_shared
@@ -154,7 +168,8 @@ def knows(tick: int, v_mps: float = 0.5) -> Ask:
 @pytest.mark.engine
 def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_it_was_asked_for(tmp_path: Path) -> None:
     """Of episodes asked together: NaN and a reset that raises concern one of them; what act_batch raises, and an answer
-    too few, all; one that hangs or exits takes the renderer with it, and who was not asked knows that it was not."""
+    too few, all; one that hangs, exits or closes what is not its own takes the renderer with it, and who was not asked
+    knows that it was not."""
     with renderer_for(tmp_path, Knowing(), Patience(answer_s=1.0)) as renderer:
 
         def begun(*names: str) -> list[RendererLink]:
@@ -192,7 +207,12 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
             fails.ask(Begin())
         fails._wire.close()
         renderer.tend()
-        for number, name in enumerate(("hangs", "exits"), start=1):
+        ends = {
+            "hangs": End("the renderer process was ended", 1.0),
+            "exits": End("the renderer process ended with exit code 7 in the policy's act at 0.50 s"),
+            "closes": End("the renderer process ended with exit code 1"),
+        }
+        for number, (name, end) in enumerate(ends.items(), start=1):
             honest_one, other = begun("honest", name)
             other.tell(knows(10))
             while name == "hangs" and renderer.end_of(1) is None:
@@ -203,11 +223,23 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
             with pytest.raises(RendererLost) as lost:
                 honest_one.reply("act at 0.50 s")
             assert (lost.value.number, lost.value.asked) == (number, "")
-            assert renderer.end_of(number) == (
-                End("the renderer process was ended", 1.0)
-                if name == "hangs"
-                else End("the renderer process ended with exit code 7 in the policy's act at 0.50 s")
-            )
+            assert renderer.end_of(number) == end
+
+
+def test_a_policy_may_write_into_what_it_is_told_from_afar() -> None:
+    """What arrives is equal to the bit and its reader's own: write-protected as an episode's is, no more than that."""
+    people = People.of(("c1", "c2"), [[3.0, 0.1], [1 / 3, 0.2]], [0.0, 1.0], [1.0, 0.0], ("walk", "sit"), kind=[1, 2])
+    sent = Draw(RobotState(Pose(0.1, 0.2, 0.3), 0.4), Street(7, people, signals={"x": Signal(True, 2.5)}))
+    came = decode_request(encode_exchange(sent))
+    assert isinstance(came, Draw) and came.robot == sent.robot and came.street.signals == sent.street.signals
+    for column in dataclasses.fields(People):
+        mine, theirs = getattr(people, column.name), getattr(came.street.people, column.name)
+        assert type(mine) is type(theirs)
+        if isinstance(mine, np.ndarray):
+            assert mine.dtype == theirs.dtype and mine.tobytes() == theirs.tobytes() and not theirs.flags.writeable
+            theirs.setflags(write=True)
+        else:
+            assert mine == theirs
 
 
 @pytest.fixture(scope="module")
