@@ -6,6 +6,7 @@ World frame: x east, y north, metres. Headings: radians, counter-clockwise from 
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,18 @@ class Pose(NamedTuple):
     def xy(self) -> Floats:
         """(2,) position in metres."""
         return np.array([self.x_m, self.y_m])
+
+
+class Circle(NamedTuple):
+    """Where something that was found at its middle is known to hold; by default nowhere."""
+
+    x_m: float = math.nan
+    y_m: float = math.nan
+    radius_m: float = 0.0
+
+    def holds(self, x_m: float, y_m: float) -> bool:
+        """Whether a point lies in it; its middle always does."""
+        return math.hypot(x_m - self.x_m, y_m - self.y_m) <= self.radius_m
 
 
 def wrap_angle(angle_rad: float) -> float:
@@ -90,13 +103,14 @@ class Polyline:
         """
         first, last = 0, len(self._lengths)
         if near_s_m is not None:
-            first = max(int(np.searchsorted(self.s_m, near_s_m[0], side="right")) - 1, 0)
-            last = min(int(np.searchsorted(self.s_m, near_s_m[1], side="left")), last)
+            first = max(bisect_right(self.s_m, near_s_m[0]) - 1, 0)
+            last = min(bisect_left(self.s_m, near_s_m[1]), last)
             first = min(first, len(self._lengths) - 1)
             last = max(last, first + 1)
         start, direction = self.points[first:last], self._directions[first:last]
         dx, dy = x_m - start[:, 0], y_m - start[:, 1]
-        along = np.clip(dx * direction[:, 0] + dy * direction[:, 1], 0.0, self._lengths[first:last])
+        along = np.maximum(dx * direction[:, 0] + dy * direction[:, 1], 0.0)
+        along = np.minimum(along, self._lengths[first:last])
         ox, oy = dx - along * direction[:, 0], dy - along * direction[:, 1]
         i = int(np.argmin(ox * ox + oy * oy))
         side = direction[i, 0] * dy[i] - direction[i, 1] * dx[i]

@@ -125,9 +125,12 @@ class People:
         """The same people in arrays of their own."""
         return People.of(*(getattr(self, column.name) for column in fields(self)))
 
-    def are(self, *kinds: PersonKind) -> NDArray[np.bool_]:
+    def are(self, kind: PersonKind, *more: PersonKind) -> NDArray[np.bool_]:
         """(N,) who is of one of these kinds."""
-        return np.isin(self.kind, kinds)
+        found: NDArray[np.bool_] = self.kind == kind.value
+        for other in more:
+            found |= self.kind == other.value
+        return found
 
     def only(self, rows: NDArray[np.intp]) -> People:
         """Those in these rows."""

@@ -29,7 +29,7 @@ from typing import Literal
 import numpy as np
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
+from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, Contact, Signal
 from cosim.episode.step import Reset, Step
 from cosim.place.street_map import WalkableArea
@@ -38,6 +38,7 @@ from cosim.spec.scenario import Scenario
 
 FREEZE_WINDOW_S = 10.0
 FREEZE_MOVE_M = 0.5
+_ROUNDING_M = 1e-6
 _APART_M = 0.1
 _APART_S = 1.0
 WAYPOINT_STEP_M = 5.0
@@ -100,6 +101,7 @@ class Referee:
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
         self._stood_ticks = 0
+        self._inside = Circle()
 
     def judge(self, step: Step) -> Verdict:
         """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
@@ -166,15 +168,22 @@ class Referee:
 
     def _out_of_lane(self, step: Step) -> Failure | None:
         pose = step.motion.robot.pose
-        if self._area.contains(pose.x_m, pose.y_m):
+        if self._inside.holds(pose.x_m, pose.y_m):
             return None
-        return self._failure("out_of_lane", step)
+        if not self._area.contains(pose.x_m, pose.y_m):
+            return self._failure("out_of_lane", step)
+        room_m = float(self._area.signed_distance(pose.xy)[0]) - _ROUNDING_M
+        self._inside = Circle(pose.x_m, pose.y_m, max(room_m, 0.0))
+        return None
 
     def _freezing(self, step: Step, waits_at_red: bool) -> Failure | None:
         if waits_at_red:
             return None
         self._window.append(step.motion.robot.pose[:2])
         if len(self._window) < (self._window.maxlen or 0):
+            return None
+        # Mostly it is far from where it was, whatever lies between.
+        if math.dist(self._window[0], self._window[-1]) > FREEZE_MOVE_M + _ROUNDING_M:
             return None
         track = np.array(self._window)
         if np.hypot(*(track - track[0]).T).max() >= FREEZE_MOVE_M:

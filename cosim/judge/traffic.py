@@ -16,7 +16,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import shapely
 
-from cosim.core.geometry import Floats, Pose
+from cosim.core.geometry import Circle, Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M, Street
 from cosim.episode.step import Step
 from cosim.place import overlay
@@ -28,6 +28,7 @@ ASIDE_M: Final = 1.0
 """Within half the vehicle's width and this of its middle line somebody is in its way."""
 
 _APART_S: Final = 2.0
+_ROUNDING_M: Final = 1e-6
 
 
 class OnRoad(NamedTuple):
@@ -44,12 +45,17 @@ class TrafficMonitor:
         self._map, self._tick_s = street_map, tick_s
         self._last: dict[str, int] = {}
         self._here: shapely.Geometry | None = None
+        self._inside = Circle()
         self._beside: dict[str, shapely.Geometry] = {}
 
     def see(self, step: Step) -> OnRoad:
         """What a tick did."""
         pose = step.motion.robot.pose
+        if self._inside.holds(pose.x_m, pose.y_m):
+            return OnRoad()
         if self._here is not None and shapely.contains_xy(self._here, pose.x_m, pose.y_m):
+            room_m = shapely.distance(shapely.boundary(self._here), shapely.Point(pose.x_m, pose.y_m))
+            self._inside = Circle(pose.x_m, pose.y_m, max(float(room_m) - _ROUNDING_M, 0.0))
             return OnRoad()
         place = self._map.locate(pose.x_m, pose.y_m, 0.0)
         self._here = self._beside_the_road(place.edge) if place.kind == "walk" else None

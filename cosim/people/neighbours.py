@@ -15,6 +15,8 @@ def nearby_people(people: People) -> tuple[NearbyPerson, ...]:
 
     The events' people are in the states of a query. Injected people are moved by the director and see each other here.
     """
+    if not people.kind.any():  # all are of the crowd
+        return ()
     moved = people.xy[people.are(*DIRECTED)]
     if not len(moved):
         return ()

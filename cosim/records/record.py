@@ -149,7 +149,7 @@ class StateHash:
             street.vehicles.xy,
             street.vehicles.heading,
         ):
-            self._hash.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+            self._hash.update(np.ascontiguousarray(array, dtype="<f8").data)
         names = [*street.people.ids, *street.vehicles.ids, *(c.other for c in step.motion.contacts)]
         names += [f"{name}{signal.walk}" for name, signal in sorted(street.signals.items())]
         self._hash.update("|".join(names).encode())
@@ -161,8 +161,9 @@ class StateHash:
 def log_row(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
     """The 14 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
     robot = step.motion.robot
-    track = np.vstack([step.robot.pose[:2], step.motion.trace[:, :2]])
-    travelled_m = float(np.hypot(*np.diff(track, axis=0).T).sum())
+    track = np.concatenate([[step.robot.pose[:2]], step.motion.trace[:, :2]])
+    way = track[1:] - track[:-1]
+    travelled_m = float(np.hypot(way[:, 0], way[:, 1]).sum())
     person_m = float(_away_m(step).min(initial=np.inf))
     reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
     speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)

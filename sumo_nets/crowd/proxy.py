@@ -15,7 +15,7 @@ from typing import Final, NamedTuple
 import shapely
 from shapely.geometry import LineString
 
-from cosim.core.geometry import Pose, heading_to_sumo
+from cosim.core.geometry import Circle, Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
 from sumo_nets.crowd.sidewalk_lead import SidewalkLead
 from sumo_nets.engine import Sumo
@@ -46,17 +46,6 @@ class Walk(NamedTuple):
     around: str
     first: str
     second: str
-
-
-class _Circle(NamedTuple):
-    """What was found at its middle holds all over it."""
-
-    x_m: float = math.nan
-    y_m: float = math.nan
-    radius_m: float = 0.0
-
-    def holds(self, x_m: float, y_m: float) -> bool:
-        return math.hypot(x_m - self.x_m, y_m - self.y_m) <= self.radius_m
 
 
 class Walks:
@@ -198,7 +187,7 @@ class Proxy:
         self._place = Located("off", "")
         self._piece: shapely.Geometry | None = None
         self._outline: shapely.Geometry | None = None
-        self._inside = self._compared = _Circle()
+        self._inside = self._compared = Circle()
         self._leads = False
 
     def update(self, pose: Pose) -> None:
@@ -240,7 +229,7 @@ class Proxy:
             return False
         if walk != self._walk or not self._compared.holds(x_m, y_m):
             lead_m = self._walks.lead.metres(walk.first, walk.second, x_m, y_m) - NEARER_M
-            self._leads, self._compared = lead_m > 0.0, _Circle(x_m, y_m, abs(lead_m) / 2.0)
+            self._leads, self._compared = lead_m > 0.0, Circle(x_m, y_m, abs(lead_m) / 2.0)
         return self._leads
 
     def _locate(self, x_m: float, y_m: float) -> Located:
@@ -258,7 +247,7 @@ class Proxy:
         room_m = 0.0
         if self._piece is not None and shapely.contains_xy(self._piece, x_m, y_m):
             room_m = max(float(shapely.distance(self._outline, shapely.Point(x_m, y_m))) - _ROUNDING_M, 0.0)
-        self._inside = _Circle(x_m, y_m, room_m)
+        self._inside = Circle(x_m, y_m, room_m)
         return self._place
 
 

@@ -125,6 +125,17 @@ def test_out_of_lane_is_the_base_centre_outside_the_walkable_area() -> None:
     assert verdict.reset is not None and verdict.reset.pose == (25.0, 0.0, 0.0)
 
 
+def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() -> None:
+    """Where the area holds the base centre nothing is told, outside it is, in every one of 800 steps of all lengths."""
+    rng, one, y_m, told = np.random.default_rng(6), referee(), 0.0, []
+    for tick in range(800):
+        y_m = float(np.clip(y_m + rng.normal(0.0, 0.3) * rng.random() ** 3, -2.3, 2.3))
+        failure = one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failure
+        told.append(failure is not None)
+        assert told[-1] is not AREA.contains(20.0 + 0.05 * tick, y_m)
+    assert 50 < sum(told) < 750
+
+
 def test_freezing_is_half_a_metre_in_ten_seconds() -> None:
     """A robot that stands for 10 s freezes at once then; one that creeps 0.06 m/s does not; the count starts anew."""
     still = judge_all(referee(), [step(t, 20.0) for t in range(402)])
