@@ -8,13 +8,13 @@ import msgspec
 
 from cosim.core.errors import EngineError
 
-_T = TypeVar("_T", bound=msgspec.Struct)
+_T = TypeVar("_T")
 
 _encoder = msgspec.msgpack.Encoder()
 
 
-def encode(message: msgspec.Struct) -> bytes:
-    """A message as MessagePack, fields by name."""
+def encode(message: msgspec.Struct | tuple[msgspec.Struct, ...]) -> bytes:
+    """A message, or several, as MessagePack, fields by name."""
     return _encoder.encode(message)
 
 

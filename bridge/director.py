@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Annotated, TypeVar
 
 import msgspec
@@ -20,7 +21,7 @@ from bridge.codec import decode, encode
 from bridge.session import Session
 from cosim.core.errors import DirectorLost, EngineError
 from cosim.core.state import PersonKind
-from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.events import Event, EventQuery, EventReply
 
 React = Callable[[EventQuery], EventReply]
 Waiting = Callable[[str], None]
@@ -30,7 +31,7 @@ NOTICE_S = 2.0
 LONGEST_REASON = 500
 """Letters: what a broken director says may be of any length."""
 
-_T = TypeVar("_T", bound=msgspec.Struct)
+_T = TypeVar("_T")
 
 
 class Signed(msgspec.Struct, frozen=True):
@@ -55,9 +56,35 @@ def opened(payload: bytes, kind: type[_T], by: str) -> _T:
     return decode(bytes(envelope.message), kind)
 
 
+class QueryParts(msgspec.Struct, frozen=True):
+    """A query as it travels. events: its own, apart, because they are the same at every tick."""
+
+    query: msgspec.Raw
+    events: msgspec.Raw
+
+
+def signed_query(query: EventQuery, by: str) -> bytes:
+    """A signed query."""
+    bare = msgspec.structs.replace(query, events=())
+    return signed(QueryParts(msgspec.Raw(encode(bare)), msgspec.Raw(encode(query.events))), by)
+
+
+def opened_query(payload: bytes, by: str) -> EventQuery:
+    """The query in a payload. Raises EngineError as `opened` does."""
+    told = opened(payload, QueryParts, by)
+    query = decode(bytes(told.query), EventQuery)
+    return msgspec.structs.replace(query, events=_events(bytes(told.events)))
+
+
+@lru_cache(maxsize=64)
+def _events(payload: bytes) -> tuple[Event, ...]:
+    """Read, and checked by the events themselves, once for an episode."""
+    return decode(payload, tuple[Event, ...])
+
+
 def serve_director(session: Session, key: str, react: React, by: str = "") -> None:
     """Answer the simulator's queries on `key` with the pure function `react`. by: the version of its behaviours."""
-    session.serve(key, lambda payload: signed(react(opened(payload, EventQuery, by)), by))
+    session.serve(key, lambda payload: signed(react(opened_query(payload, by)), by))
 
 
 class RemoteDirector:
@@ -76,7 +103,7 @@ class RemoteDirector:
     def react(self, query: EventQuery) -> EventReply:
         """The director's reply. Raises DirectorLost when none comes or it answers something else."""
         try:
-            reply = opened(self._ask(signed(query, self._by), query.tick), EventReply, self._by)
+            reply = opened(self._ask(signed_query(query, self._by), query.tick), EventReply, self._by)
             _check(reply, query)
         except (TimeoutError, EngineError) as error:
             why = str(error)[:LONGEST_REASON]

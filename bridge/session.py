@@ -24,6 +24,7 @@ _Heard = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """In zenoh's errors: where it was built, of no use to anybody here."""
 
+_ANSWER = "answer"
 _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
 
@@ -151,8 +152,9 @@ class Session:
 class LoneSession(Session):
     """A session with nobody else in it and no socket: what it asks it answers itself, in the thread that asks.
 
-    Question and answer are publications, not a query: over a query's time watches a thread of Zenoh's, and on a busy
-    machine whoever wakes it waits for a turn of its own. What interrupts the thread that asks interrupts the handler.
+    For one thread. Question and answer are publications, not a query: a thread of Zenoh's watches over the time of a
+    query, and on a busy machine whoever wakes it waits for a turn of its own. What interrupts the thread that asks
+    interrupts the handler.
     """
 
     def __init__(self) -> None:
@@ -161,33 +163,33 @@ class LoneSession(Session):
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer what is asked on `key`, in `ask`."""
-        questions, answers = (self._session.declare_subscriber(heard) for heard in (key, f"{key}/*"))
-        self._subscribers += [questions, answers]
-        self._served.append((questions, answers, handler))
+        # Of the newest alone: an interrupted `ask` may have left a question or an answer behind.
+        question = self._session.declare_subscriber(key, zenoh.handlers.RingChannel(1))
+        answer = self._session.declare_subscriber(f"{key}/{_ANSWER}", zenoh.handlers.RingChannel(1))
+        self._subscribers += [question, answer]
+        self._served.append((question, answer, handler))
 
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """The answer to one question. Raises TimeoutError at once when nobody serves the key, EngineError when its
         handler raised."""
         self._session.put(key, payload)
-        told = None
-        for questions, answers, handler in self._served:
-            while (asked := questions.try_recv()) is not None:
-                self._answer(str(asked.key_expr), handler, asked.payload.to_bytes())
-            while (answer := answers.try_recv()) is not None:
-                told = answer  # the last: one that was interrupted may have left its own
-        if told is None:
-            raise TimeoutError(f"nobody answers on '{key}'")
-        if str(told.key_expr) == f"{key}/error":
-            raise EngineError(f"'{key}' answered: {told.payload.to_string()}")
-        return bytes(told.payload.to_bytes())
+        for question, answer, handler in self._served:
+            if (asked := question.try_recv()) is not None:
+                self._answer(f"{key}/{_ANSWER}", handler, asked.payload.to_bytes())
+                told = answer.try_recv()
+                assert told is not None  # it was put in this thread
+                if told.attachment is not None:
+                    raise EngineError(f"'{key}' answered: {told.payload.to_string()}")
+                return bytes(told.payload.to_bytes())
+        raise TimeoutError(f"nobody answers on '{key}'")
 
     def _answer(self, key: str, handler: Handler, payload: bytes) -> None:
         try:
             answer = handler(payload)
         except Exception as error:  # noqa: BLE001  as over a query
-            self._session.put(f"{key}/error", f"{type(error).__name__}: {error}")
+            self._session.put(key, f"{type(error).__name__}: {error}", attachment=b"error")
         else:
-            self._session.put(f"{key}/answer", answer)
+            self._session.put(key, answer)
 
 
 def _open(mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str) -> zenoh.Session:

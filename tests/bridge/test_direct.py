@@ -58,15 +58,14 @@ import sys, time
 import msgspec
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import Signed, opened, signed
+from bridge.director import opened_query, signed
 from bridge.session import Session
-from cosim.spec.events import EventQuery
 from scenarios.events import react
 from scenarios.execution.directing import behaviours
 
 last = {}
 def lie(payload):
-    query = opened(payload, EventQuery, behaviours())
+    query = opened_query(payload, behaviours())
     reply, by, replace = react(query), behaviours(), msgspec.structs.replace
     before, last[query.episode] = last.get(query.episode, reply), reply
     if query.tick < 3 or query.episode == "honest":

@@ -14,7 +14,7 @@ import pytest
 
 from bridge import keys
 from bridge.codec import decode, encode
-from bridge.director import RemoteDirector, opened, serve_director, signed
+from bridge.director import QueryParts, RemoteDirector, opened_query, serve_director, signed, signed_query
 from bridge.session import LoneSession, Session
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
@@ -185,7 +185,7 @@ def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) 
         with pytest.raises(DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"):
             RemoteDirector(client, KEY, by="cafe").react(query())
         lax = keys.director("test", "lax")
-        hub.serve(lax, lambda payload: signed(echo(opened(payload, EventQuery, "cafe")), theirs))
+        hub.serve(lax, lambda payload: signed(echo(opened_query(payload, "cafe")), theirs))
         with pytest.raises(DirectorLost, match=f"'{theirs}' met behaviours 'cafe'"):
             RemoteDirector(client, lax, by="cafe").react(query())
 
@@ -197,7 +197,7 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
         for run, env in (("a", "x"), ("b", "y")):
             assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
         with pytest.raises(EngineError, match="ask for exactly"):
-            client.ask(keys.director("a", "x").replace("a", "*", 1), signed(query(), ""), timeout_s=PATIENCE_S)
+            client.ask(keys.director("a", "x").replace("a", "*", 1), signed_query(query(), ""), timeout_s=PATIENCE_S)
 
 
 def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> None:
@@ -222,7 +222,7 @@ def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None
     """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
     with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
-        with pytest.raises(EngineError, match=r"not a (Signed|EventQuery) message"):
+        with pytest.raises(EngineError, match=r"not a (Signed|QueryParts) message"):
             client.ask(KEY, payload, timeout_s=PATIENCE_S)
         assert RemoteDirector(client, KEY).react(query(3)).tick == 3
 
@@ -252,3 +252,14 @@ def test_names_that_cannot_stand_in_a_key_are_refused() -> None:
 def test_messages_travel_by_field_name() -> None:
     """A message reads back as it was written, and an unknown field of a newer writer is ignored."""
     assert decode(encode(query(5)), EventQuery) == query(5)
+
+
+def test_a_query_holds_its_own_events_however_often_others_are_asked_between() -> None:
+    """Two episodes in turns, and one that changes its events; events that cannot be are refused every time."""
+    queries = [msgspec.structs.replace(query(k), events=(event(route_s_m=5.0 + k % 2),) * (k % 3)) for k in range(12)]
+    assert [opened_query(signed_query(one, "cafe"), "cafe") for one in queries] == queries
+    wrong = encode(event()).replace(b"\xa2e0", b"\xa2x0")
+    parts = QueryParts(msgspec.Raw(encode(query())), msgspec.Raw(b"\x91" + wrong))
+    for _ in range(2):
+        with pytest.raises(EngineError, match="ids of event pedestrians start with 'e'"):
+            opened_query(signed(parts, "cafe"), "cafe")
