@@ -120,7 +120,7 @@ class BulletWorld:
         for kind, ways in close.items():
             if ways:
                 found.update(self._overlaps(kind, ways, poses))
-        contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other)))
+        contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
         return Motion(bodies.robot_state(), poses, contacts)
 
     def _lead(
