@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections import Counter
 
+import moderngl
 import numpy as np
 import pytest
 
@@ -92,6 +94,47 @@ def moment(world: BulletWorld, n: int = 0) -> tuple[RobotState, Street]:
 def same(one: Frame, other: Frame) -> bool:
     assert one.labels is not None and other.labels is not None
     return np.array_equal(one.rgb, other.rgb) and np.array_equal(one.labels, other.labels)
+
+
+def test_a_camera_frees_what_it_makes_but_for_programs_which_are_made_once(
+    world: BulletWorld, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From the second camera of a process on nothing is left of one in the graphics card's memory."""
+    alive: Counter[str] = Counter()
+
+    def counted(owner: type, method: str, kind: str, by: int) -> None:
+        done = getattr(owner, method)
+
+        def call(self: object, *args: object, **named: object) -> object:
+            alive[kind] += by
+            return done(self, *args, **named)
+
+        monkeypatch.setattr(owner, method, call)
+
+    for kind in ("buffer", "texture", "framebuffer", "vertex_array", "program"):
+        counted(moderngl.Context, kind, kind, 1)
+        counted(getattr(moderngl, kind.title().replace("_", "")), "release", kind, -1)
+    counted(moderngl.Context, "depth_texture", "texture", 1)
+    left = []
+    for n in (0, 9, 9, 0):
+        with GlCamera(world, SPEC) as camera:
+            camera.render(*moment(world, n))
+        left.append(dict(alive))
+    assert left[1]["buffer"] >= left[0]["buffer"] > 0  # something is counted, and forms grow with what is seen
+    assert left[2] == left[1] and left[3] == left[1]
+
+
+def test_cameras_of_two_lights_at_once_draw_each_its_own(world: BulletWorld) -> None:
+    """They share programs, not what a light sets in them."""
+    robot, street = moment(world)
+    lights = (Light(), Light(hour=20.5, fog_m=60.0))
+    alone = []
+    for light in lights:
+        with GlCamera(world, SPEC, light=light) as camera:
+            alone.append(camera.render(robot, street))
+    with GlCamera(world, SPEC, light=lights[0]) as noon, GlCamera(world, SPEC, light=lights[1]) as dusk:
+        pictures = [camera.render(robot, street) for camera in (noon, dusk, noon, dusk)]
+    assert all(same(picture, alone[i % 2]) for i, picture in enumerate(pictures)) and not same(*alone)
 
 
 def test_a_picture_depends_on_its_moment_alone(world: BulletWorld) -> None:

@@ -38,12 +38,13 @@ class Backdrop:
     """One triangle over the whole picture, at the far end of the depth; draw it last."""
 
     def __init__(self, context: moderngl.Context, sky: Sky) -> None:
-        program = programs(context, _VERTEX, _FRAGMENT, shadows=False).colour
-        program["all_around"] = tuple(float(c) for c in sky.fog_colour)
-        self._array = context.vertex_array(program, [])
+        self._program = programs(context, _VERTEX, _FRAGMENT, shadows=False).colour
+        self._all_around = tuple(float(c) for c in sky.fog_colour)
+        self._array = context.vertex_array(self._program, [])
         self._sky = sky_texture(context, sky.radiance)
 
     def draw(self) -> None:
+        self._program["all_around"] = self._all_around
         self._sky.use(SKY_UNIT)
         self._array.render(moderngl.TRIANGLES, vertices=3)
 

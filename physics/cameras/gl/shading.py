@@ -40,6 +40,7 @@ picture; front faces are counter-clockwise as in physics.world.mesh."""
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Final, Literal, NamedTuple
 
 import moderngl
@@ -153,10 +154,12 @@ void show(vec3 albedo, vec3 normal, vec3 at, float label) {
 _NOTHING = "#version 430\nvoid main() {}\n"
 
 
+@lru_cache(maxsize=64)
 def programs(context: moderngl.Context, vertex: str, fragment: str, shadows: bool) -> Programs:
     """A drawable's programs: for the picture, and for shadow maps. vertex, fragment: GLSL without a version line.
 
-    shadows: whether `show` looks into the shadow maps.
+    shadows: whether `show` looks into the shadow maps. They stay as long as the context, for all who ask for the same:
+    what a uniform is to be for one of them is set before each drawing.
     """
     head = _BLOCK + ("#define SHADOWS\n" if shadows else "")
     return Programs(
