@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from cosim.core.errors import CosimError
     from cosim.core.state import Command
     from cosim.episode.log import Log
-    from cosim.episode.ports import CameraSpec, Manifest, Observation, Policy
+    from cosim.episode.ports import BatchPolicy, CameraSpec, Manifest, Observation, Policy
     from cosim.policies.load import load_policy
     from cosim.records.record import Record
     from cosim.spec.options import EpisodeOptions
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from scenarios.execution.suite_run import run
 
 __all__ = [
+    "BatchPolicy",
     "CameraSpec",
     "Command",
     "CosimError",
@@ -56,6 +57,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "BatchPolicy": "cosim.episode.ports",
     "CameraSpec": "cosim.episode.ports",
     "Command": "cosim.core.state",
     "CosimError": "cosim.core.errors",

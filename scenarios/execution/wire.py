@@ -9,7 +9,8 @@ from contextlib import suppress
 from typing import Final
 
 _LENGTH: Final = struct.Struct("!I")
-_CHUNK_BYTES: Final = 1 << 20
+_CHUNK_BYTES: Final = 1 << 16
+"""Taken at a time: of more a process asks the kernel for memory each time, which takes longer than most messages."""
 _MOST_BYTES: Final = 1 << 30
 """A message that says it is longer is none: a policy has written to its process's socket."""
 
