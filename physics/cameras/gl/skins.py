@@ -90,14 +90,14 @@ void main() {
     vec2 way = in_ring.z * across + in_ring.w * before;
     if (still) way = in_ring.zw;
     float ribbon = still ? 0.0 : float(in_coat.w);
-    float near = length(vec2(before.x < 0.0 ? half_.x * in_ring.x : half_.x, half_.y) * before);
+    float thick = length(vec2(before.x < 0.0 ? half_.x * in_ring.x : half_.x, half_.y) * before);
     if (way.x < 0.0) half_.x *= in_ring.x;
     // the corner is where the outline of a superellipse has the normal `way`
     float dual = in_ring.y / (in_ring.y - 1.0);
     vec2 lean = max(half_ * abs(way), 1e-9), power = pow(lean, vec2(dual));
     vec2 corner = half_ * sign(way) * (power / lean) * pow(power.x + power.y, -1.0 / in_ring.y);
     // a ribbon lies where the tube is nearest, and is shaded as if it were round
-    corner += before * (near * ribbon * RAISED);
+    corner += before * (thick * ribbon * RAISED);
     way = normalize(way + ribbon * before);
     at = middle + ahead_ * corner.x + side * corner.y;
     normal = ahead_ * way.x + side * way.y;

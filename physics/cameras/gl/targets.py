@@ -121,7 +121,8 @@ def _parting_program(context: moderngl.Context) -> moderngl.Program:
         float byte_at(int k, ivec2 size) {
             int colours = 3 * size.x * size.y;
             int at = k < colours ? k / 3 : k - colours;
-            return texelFetch(picture, ivec2(at % size.x, at / size.x), 0)[k < colours ? k - 3 * at : 3];
+            vec4 seen = texelFetch(picture, ivec2(at % size.x, at / size.x), 0);
+            return seen[k < colours ? k - 3 * at : 3];
         }
         void main() {
             ivec2 size = textureSize(picture, 0), here = ivec2(gl_FragCoord.xy);
