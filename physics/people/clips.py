@@ -33,12 +33,14 @@ class Clips:
 
     They take a vertex, as modelled, to the posed body, in the body frame (x ahead, y left, z up, the ground at 0).
     gaits: (families, paces) first rows of strides of `stride_frames` frames; gestures: name -> (families,) first rows
-    of loops of `loop_frames` frames and `loop_s` seconds.
+    of loops of `loop_frames` frames and `loop_s` seconds; loops: the same as (gestures, families), in the order of
+    GESTURES.
     """
 
     matrices: NDArray[np.float32]
     gaits: NDArray[np.intp]
     gestures: Mapping[str, NDArray[np.intp]]
+    loops: NDArray[np.intp]
     stride_frames: int = STRIDE_FRAMES
     loop_frames: int = LOOP_FRAMES
     loop_s: float = LOOP_S
@@ -48,7 +50,8 @@ class Clips:
 def own_clips() -> Clips:
     """The motions of our own bodies."""
     arrays = baked("clips", _MADE_BY, _made)
-    return Clips(arrays["matrices"], arrays["gaits"], {name: arrays[name] for name in GESTURES})
+    gestures = {name: arrays[name] for name in GESTURES}
+    return Clips(arrays["matrices"], arrays["gaits"], gestures, np.stack(list(gestures.values())))
 
 
 def _made() -> Arrays:

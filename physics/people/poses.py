@@ -55,8 +55,8 @@ def poses_of(
 ) -> Poses:
     """The poses of N people, of any number of streets. bodies: (N, 4), of `bodies_of`; pace, strides: (N,), as in
     `People`; loops: (N,), of `loops_of`; time_s: of all or (N,)."""
-    family, stature, size, offset = bodies[:, 0].astype(np.intp), bodies[:, 1], bodies[:, 2], bodies[:, 3]
-    pace = relative_pace(pace, stature)
+    family, size, offset = bodies[:, 0].astype(np.intp), bodies[:, 2], bodies[:, 3]
+    pace = pace * bodies[:, 1]
     knot = _PACES[1:-1].searchsorted(pace, side="right")
     faster = np.minimum(np.maximum((pace - _PACES[knot]) / _APART[knot], 0.0), 1.0)
 
@@ -81,7 +81,7 @@ def poses_of(
         frame = (now_s / clips.loop_s + offset[slow]) % 1.0 * clips.loop_frames
         low = np.minimum(frame.astype(np.intp), clips.loop_frames - 1)
         late = frame - low
-        first = np.array([clips.gestures[name] for name in GESTURES])[loops[slow], family[slow]]
+        first = clips.loops[loops[slow], family[slow]]
         rows[slow, 2], rows[slow, 3] = first + low, first + (low + 1) % clips.loop_frames
         weights[slow, :2] *= walk[:, None]
         weights[slow, 2], weights[slow, 3] = (1.0 - walk) * (1.0 - late), (1.0 - walk) * late
@@ -96,8 +96,8 @@ def loops_of(doing: tuple[Doing, ...]) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=256)
 def bodies_of(names: tuple[str, ...], ages: bytes) -> Floats:
-    """(N, 4) of each person: row of the family, stature in metres, factor on the family's body, where in a loop it is
-    at time 0."""
+    """(N, 4) of each person: row of the family, factor on the pace to that of the reference person, factor on the
+    family's body, where in a loop it is at time 0."""
     return np.array([_body_of(name, age) for name, age in zip(names, ages, strict=True)]).reshape(-1, 4)
 
 
@@ -105,7 +105,8 @@ def bodies_of(names: tuple[str, ...], ages: bytes) -> Floats:
 def _body_of(name: str, age: int) -> tuple[float, float, float, float]:
     family: Family = family_of(name, age)
     stature = stature_m(name, age)
-    return float(FAMILIES.index(family)), stature, stature / _STATURES[family], first_stride(name)
+    pace = float(relative_pace(1.0, stature))
+    return float(FAMILIES.index(family)), pace, stature / _STATURES[family], first_stride(name)
 
 
 _STATURES: Final[dict[Family, float]] = {"man": 1.75, "woman": 1.64, "child": 1.25, "elder": 1.66}

@@ -102,11 +102,11 @@ class CrowdDrawing:
         self._near = mesh_skins(context, lambda outfit, level: body(ALL[outfit], level))
         self._far = tube_skins(context, lambda outfit, level: far_body(ALL[outfit], level))
         self._held: list[moderngl.Buffer | moderngl.Texture | moderngl.Framebuffer] = []
-        self._starts = np.zeros((LEVELS * len(ALL), 3), dtype=np.uint32)
+        self._starts = np.zeros((_KEYS, 3), dtype=np.uint32)
         self._known = np.zeros(len(self._starts), dtype=bool)
         self._split: list[list[int]] = []
         self._room = 0
-        self._dyed_for: list[tuple[tuple[str, ...], bytes]] = []
+        self._dressed: list[tuple[tuple[str, ...], bytes]] = []
         self._grow(_CROWD_MIN)
 
     def set(self, watched: Sequence[PeopleSeen], shots: Shots) -> None:
@@ -125,11 +125,8 @@ class CrowdDrawing:
             return
         whose, xy, seen, casts = whose[rows], xy[rows], seen[rows], casts[rows]
         z_m = _heights(watched, whose, xy)
-        who = [(one.people.ids, one.people.age.tobytes()) for one in watched]
-        worn = [_worn(*one) for one in who]
-        outfit, girth, bodies = (
-            np.concatenate([getattr(one, name) for one in worn])[rows] for name in ("outfit", "girth", "bodies")
-        )
+        worn = self._dress([(one.people.ids, one.people.age.tobytes()) for one in watched])
+        outfit, girth, bodies = worn.outfit[rows], worn.girth[rows], worn.bodies[rows]
         heading, strides, pace = (
             np.concatenate([getattr(one.people, name) for one in watched])[rows]
             for name in ("heading", "strides", "pace")
@@ -141,13 +138,7 @@ class CrowdDrawing:
         told[:, 0], told[:, 1] = posed.rows, posed.weights
         told[:, 2, :2], told[:, 2, 2], told[:, 2, 3] = xy - shots.anchor[whose], z_m, posed.scale
         told[:, 3, 0], told[:, 3, 1] = np.cos(heading), np.sin(heading)
-        if sum(counts) > self._room:
-            self._grow(2 * sum(counts))
         self._told.write(told, viewport=(0, 0, 4, len(rows)))
-        if who != self._dyed_for:
-            colours = np.concatenate([one.colours for one in worn])
-            self._dyed.write(colours, viewport=(0, 0, len(COATS), len(colours)))
-            self._dyed_for = who
         self._set_draws(whose, outfit, levels(shots, whose, xy, z_m), seen, casts, girth, rows)
         self._posed.use()
         self._posed.viewport = (0, 0, _ROW, len(rows))
@@ -157,6 +148,19 @@ class CrowdDrawing:
         self._everywhere.render(moderngl.TRIANGLES, vertices=3)
         self._matrices.use(0)
         self._dyed.use(1)
+
+    def _dress(self, who: list[tuple[tuple[str, ...], bytes]]) -> _Worn:
+        """What all of them wear, picture after picture, and their colours on the graphics card; mostly it is as it was.
+        who: names and ages."""
+        if who != self._dressed:
+            each = [_worn(*one) for one in who]
+            self._worn = _Worn(*(np.concatenate(column) for column in zip(*each, strict=True)))
+            count = len(self._worn.outfit)
+            if count > self._room:
+                self._grow(2 * count)
+            self._dyed.write(self._worn.colours, viewport=(0, 0, len(COATS), count))
+            self._dressed = who
+        return self._worn
 
     def draw(self, stage: Pass, shadows: bool, picture: int = 0) -> None:
         """Draw those of a picture; in the shadow maps of what moves everybody has few triangles. shadows: whether they
@@ -206,18 +210,20 @@ class CrowdDrawing:
 
     def _start(self, form: NDArray[np.intp]) -> NDArray[np.uint32]:
         """(F, 3) where bodies begin, by level * outfits + outfit; who casts a shadow has the coarsest level."""
-        form = np.where(form < LEVELS * len(ALL), form, form - len(ALL))
         if not self._known[form].all():
             for one in dict.fromkeys(form[~self._known[form]].tolist()):
                 level, outfit = divmod(one, len(ALL))
-                self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(outfit, level)
+                if level == LEVELS:
+                    self._starts[one] = self._start(np.array([one - len(ALL)]))
+                else:
+                    self._starts[one] = (self._near if level < MESH_LEVELS else self._far).start(outfit, level)
                 self._known[one] = True
         return self._starts[form]
 
     def _grow(self, room: int) -> None:
         """Make room for more people."""
         self._release_room()
-        self._room, self._dyed_for = room, []
+        self._room = room
         self._told = _texture(self._context, (4, room), 4, "f4")
         self._dyed = _texture(self._context, (len(COATS), room), 3, "f1")
         self._matrices = _texture(self._context, (_ROW, room), 4, "f4")
