@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal
 
 from cosim.core.errors import EngineError
@@ -28,6 +28,7 @@ WALL_M: Final = 0.2
 FAR_BELOW_M: Final = -50.0
 _AROUND_M: Final = 0.5
 """What stands around the robot is looked up anew when it has moved by so much."""
+_NO_CHANGE: Final = (0.0, 0.0, 0.0)
 _NOWHERE: Final = (math.inf, math.inf, math.inf)
 _UPRIGHT: Final = (0.0, 0.0, 0.0, 1.0)
 _TYRE: Final = {
@@ -46,7 +47,7 @@ _Placing = tuple[tuple[float, float, float], tuple[float, float, float, float]]
 
 
 class Bodies:
-    """A running engine. Bodies that are not led wait far below the ground.
+    """A running engine. Bodies that are not shown wait far below the ground for their next use.
 
     at_m: where the robot's base frame is; yaw_rate_radps: its rate of turn about the vertical; watched: the bodies that
     `robot_contacts` asks for.
@@ -60,7 +61,8 @@ class Bodies:
         self._what: dict[int, tuple[BodyKind, str]] = {}
         self._pools: dict[Any, list[int]] = {}
         self._shown: dict[Moving, dict[str, tuple[int, Any]]] = {"pedestrian": {}, "vehicle": {}}
-        self._led: dict[Moving, dict[int, list[_Placing]]] = {"pedestrian": {}, "vehicle": {}}
+        self._led: dict[Moving, list[tuple[int, list[_Placing]]]] = {}
+        self._left_at: dict[int, tuple[float, float, float]] = {}
         self.at_m, self.yaw_rate_radps = _NOWHERE, 0.0
         self._looked_from = _NOWHERE
         self._around: dict[int, Any] = {}
@@ -153,7 +155,7 @@ class Bodies:
             self._what.pop(body, None)
 
     def show(self, kind: Moving, movers: Sequence[Mover]) -> None:
-        """Let exactly these people or vehicles have a body, which waits until it is led."""
+        """Let exactly these people or vehicles have a body, which stays where it is until it is led."""
         shown, ids = self._shown[kind], [mover.id for mover in movers]
         if list(shown) == ids:
             return
@@ -170,24 +172,26 @@ class Bodies:
                 self._what[body] = (kind, mover.id)
         self._shown[kind] = {name: shown[name] for name in ids}
 
+    def stands(self, kind: Moving, mover: Mover) -> bool:
+        """Whether a shown body is where it was led to, and stays there."""
+        return mover.change == _NO_CHANGE and self._left_at.get(self._shown[kind][mover.id][0]) == mover.start
+
     def lead(self, kind: Moving, ways: Mapping[Mover, TickPoses], z_m: Sequence[float]) -> None:
-        """Let these of the shown go their ways, substep by substep (`step`); the others wait. z_m: height of the ground
+        """Let these of the shown go their ways, substep by substep (`step`); the others stay. z_m: height of the ground
         under each."""
-        if not ways and not self._led[kind]:
-            return
-        bodies = [self._shown[kind][mover.id][0] for mover in ways]
-        for body in self._led[kind].keys() - set(bodies):
-            self._park(body)
         half = 0.5 * (PERSON_M if kind == "pedestrian" else VEHICLE_M)
-        self._led[kind] = {
-            body: [
+        self._led[kind] = []
+        for (mover, way), z in zip(ways.items(), z_m, strict=True):
+            body = self._shown[kind][mover.id][0]
+            self._left_at[body] = way[-1]
+            placings = [
                 ((x, y, z + half), (0.0, 0.0, math.sin(0.5 * heading), math.cos(0.5 * heading)))
                 for x, y, heading in way
             ]
-            for body, way, z in zip(bodies, ways.values(), z_m, strict=True)
-        }
+            self._led[kind].append((body, placings))
 
     def _park(self, body: int) -> None:
+        self._left_at.pop(body, None)
         p.resetBasePositionAndOrientation(body, (0.0, 0.0, FAR_BELOW_M), _UPRIGHT, self._client)
 
     def _taken(self, pool: Any) -> int:
@@ -231,7 +235,7 @@ class Bodies:
         speeds_radps: at which the motors turn the drive's joints, in the order of `Skid.joints`.
         """
         for led in self._led.values():
-            for body, way in led.items():
+            for body, way in led:
                 p.resetBasePositionAndOrientation(body, *way[substep], self._client)
         if speeds_radps != self._asked_radps:  # the motors keep what they were asked for
             self._asked_radps = speeds_radps
@@ -263,8 +267,8 @@ class Bodies:
         pose = Pose(x, y, math.atan2(m[3], m[0]))
         return RobotState(pose, forward, turn, z, math.acos(min(max(m[8], -1.0), 1.0)))
 
-    def watch(self, reach_m: float) -> None:
-        """Ask for contacts with what is led and what stands within a reach of the robot, and with nothing else."""
+    def watch(self, reach_m: float, movers: Iterable[tuple[Moving, Mover]]) -> None:
+        """Ask for contacts with these of the shown, and with what stands within a reach of the robot."""
         x, y, z = self.at_m
         if math.dist(self.at_m, self._looked_from) > _AROUND_M:
             far_m = reach_m + _AROUND_M
@@ -281,8 +285,7 @@ class Bodies:
             for body, ((x0, y0, _), (x1, y1, _)) in self._around.items()
             if x0 - reach_m <= x <= x1 + reach_m and y0 - reach_m <= y <= y1 + reach_m
         ]
-        for led in self._led.values():
-            self.watched += led
+        self.watched += [self._shown[kind][mover.id][0] for kind, mover in movers]
 
     def robot_contacts(self) -> list[tuple[BodyKind, str]]:
         """What of the watched the robot touches now."""

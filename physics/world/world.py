@@ -104,40 +104,33 @@ class BulletWorld:
         }
         for kind, movers in near.items():
             bodies.show(kind, movers)
-        close: dict[Moving, dict[Mover, TickPoses]] = {kind: {} for kind in near}
-        self._lead(near, close, x, y, substeps)
+            ways = {mover: mover.way(substeps) for mover in movers if not bodies.stands(kind, mover)}
+            bodies.lead(kind, ways, self._feet(kind, ways) if ways else [])
+        close = self._watched(near, x, y)
         trace: list[float] = []
         found: set[Contact] = set()
         for k in range(substeps):
             if abs(pose[0] - x) > _STRAY_M or abs(pose[1] - y) > _STRAY_M:
                 x, y, _ = pose
-                self._lead(near, close, x, y, substeps)
+                close |= self._watched(near, x, y)
             pose = bodies.step(k, self._drive.joint_speeds(command, bodies.yaw_rate_radps, SUBSTEP_S))
             trace += pose
             if bodies.watched:
                 found |= {Contact(what, other, k) for what, other in bodies.robot_contacts()}
         poses = write_protected(trace, shape=(substeps, 3))
-        for kind, ways in close.items():
-            if ways:
-                found.update(self._overlaps(kind, ways, poses))
+        for kind, mover in close:
+            found.update(self._overlaps(kind, mover, poses))
         contacts = tuple(sorted(found, key=lambda c: (c.substep, c.kind, c.other))) if found else ()
         return Motion(bodies.robot_state(), poses, contacts)
 
-    def _lead(
-        self,
-        near: Mapping[Moving, Sequence[Mover]],
-        close: Mapping[Moving, dict[Mover, TickPoses]],
-        x_m: float,
-        y_m: float,
-        substeps: int,
-    ) -> None:
-        """Let those move in the engine whom the robot could touch while it is within _STRAY_M of a point, and add them
-        to `close` with their ways; watch them, and what stands there."""
-        for kind, movers in near.items():
-            ways = {mover: mover.way(substeps) for mover in movers if mover.passes(x_m, y_m, self._reach_m)}
-            self._engine.lead(kind, ways, self._feet(kind, ways) if ways else [])
-            close[kind].update(ways)
-        self._engine.watch(self._reach_m)
+    def _watched(self, near: Mapping[Moving, Sequence[Mover]], x_m: float, y_m: float) -> set[tuple[Moving, Mover]]:
+        """Whom the robot could touch while it is within _STRAY_M of a point. Contacts are asked for with them and with
+        what stands there, nothing else."""
+        close = {
+            (kind, mover) for kind, movers in near.items() for mover in movers if mover.passes(x_m, y_m, self._reach_m)
+        }
+        self._engine.watch(self._reach_m, close)
+        return close
 
     def _feet(self, kind: Moving, ways: Mapping[Mover, TickPoses]) -> list[float]:
         """Height of the ground under each at the end of the tick."""
@@ -148,15 +141,14 @@ class BulletWorld:
             z_m = self.surface.road(end[:, :2], end[:, 2], [mover.size_m for mover in ways])[:, 0]
         return list(map(float, z_m))
 
-    def _overlaps(self, kind: Moving, ways: Mapping[Mover, TickPoses], trace: Floats) -> list[Contact]:
-        """Overlaps of the footprint with disks or boxes, whatever the engine made of them."""
-        half, poses = 0.5 * np.array(self.footprint_m), np.array(list(ways.values())).swapaxes(0, 1)
+    def _overlaps(self, kind: Moving, mover: Mover, trace: Floats) -> list[Contact]:
+        """Overlaps of the footprint with a disk or box, whatever the engine made of it."""
+        half, way = 0.5 * np.array(self.footprint_m), np.array(mover.way(len(trace)))[:, None]
         if kind == "pedestrian":
-            hit = box_disk_gap(trace, half[0], half[1], poses[:, :, :2]) < PERSON_RADIUS_M
+            hit = box_disk_gap(trace, half[0], half[1], way[:, :, :2]) < PERSON_RADIUS_M
         else:
-            hit = boxes_overlap(trace[:, None], half, poses, 0.5 * np.array([[mover.size_m for mover in ways]]))
-        names = [mover.id for mover in ways]
-        return [Contact(kind, names[i], k) for k, i in np.argwhere(hit).tolist()]
+            hit = boxes_overlap(trace[:, None], half, way, 0.5 * np.array([[mover.size_m]]))
+        return [Contact(kind, mover.id, k) for k in np.flatnonzero(hit).tolist()]
 
     def _stream(self, x_m: float, y_m: float) -> None:
         """Load the tiles around a point and drop those left behind; nothing to do before it has moved far enough."""

@@ -70,7 +70,7 @@ def test_an_episodes_own_director_answers_in_the_thread_that_asks() -> None:
         serve_director(session, KEY, seen, by="cafe")
         director = RemoteDirector(session, KEY, by="cafe")
         assert [director.react(query(tick)) for tick in range(100)] == [echo(query(tick)) for tick in range(100)]
-        assert open_sockets() == before and threads == {threading.get_ident()}
+        assert open_sockets() <= before and threads == {threading.get_ident()}
         with pytest.raises(DirectorLost, match="'feed' met behaviours 'cafe'"):
             RemoteDirector(session, KEY, by="feed").react(query())
         with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
