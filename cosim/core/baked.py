@@ -62,7 +62,7 @@ def baked(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
         _keep(folder, arrays)
         return _read(folder)
     except (OSError, ValueError, msgspec.DecodeError) as error:
-        _say_once(f"note: {folder.parent}: not kept for the next process, which makes it anew: {error}")
+        say_not_kept(folder.parent, error)
     for array in arrays.values():
         array.flags.writeable = False
     return arrays
@@ -111,6 +111,11 @@ def _clear(parent: Path) -> None:
         with suppress(OSError):
             if time.time() - left.stat().st_mtime > _LEFT_OVER_S:
                 shutil.rmtree(left, ignore_errors=True)
+
+
+def say_not_kept(folder: Path, error: Exception) -> None:
+    """That the cache is done without, in one line on standard error, once in a process."""
+    _say_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
 
 
 @cache

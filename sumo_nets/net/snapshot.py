@@ -26,7 +26,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 import cosim
 import sumo_nets
-from cosim.core.baked import cache_folder
+from cosim.core.baked import cache_folder, say_not_kept
 from cosim.place.street_map import StreetMap
 
 SNAPSHOT_FOLDER: Final = "read"
@@ -59,8 +59,10 @@ def street_map_of(path: Path) -> StreetMap:
     with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
         return thawed(kept.read_bytes())
     street_map = _read(path)
-    with suppress(OSError):
+    try:
         _write(kept, map_as_bytes(street_map))
+    except OSError as error:
+        say_not_kept(kept.parent, error)
     return street_map
 
 

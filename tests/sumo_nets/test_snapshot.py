@@ -100,7 +100,8 @@ def test_a_cache_that_cannot_be_written_is_no_error(net: Path, tmp_path: Path, m
 
 
 def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
-    """The map is read all the same, and the next process finds nothing that it could take for one."""
+    """The map is read all the same, one line says that it is not kept, and the next process finds nothing that it could
+    take for one."""
     code = (
         "import pathlib, resource, sys\nfrom sumo_nets.net.snapshot import street_map_of\n"
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
@@ -116,6 +117,7 @@ def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
         check=False,
     )
     assert done.stdout == f"{len(read_net(net).strips)}\n", done.stderr
+    assert done.stderr.startswith(f"note: {kept / 'read'}: not kept") and len(done.stderr.splitlines()) == 1
     assert list((kept / "read").iterdir()) == []
 
 
