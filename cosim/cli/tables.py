@@ -105,6 +105,9 @@ def print_episode(out: Console, record: Record) -> None:
         what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
         fault = f", {failure.fault}" if failure.fault else ""
         out.print(f"  {Clock().time_s(failure.tick):7.2f} s  {failure.kind}{what} at {failure.route_s_m:.1f} m{fault}")
+    for contact in record.walked_into:
+        where = f"at {contact.route_s_m:.1f} m, {contact.fault}"
+        out.print(f"  {Clock().time_s(contact.tick):7.2f} s  walked into by {contact.other} {where}")
     for event in record.events:
         at = "never triggered" if event.triggered_at_s is None else f"triggered at {event.triggered_at_s:.2f} s"
         out.print(f"  event {event.id} {event.kind}: {at}")

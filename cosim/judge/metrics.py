@@ -31,7 +31,7 @@ RATE_NEEDS_M = 1.0
 @dataclass(frozen=True)
 class EpisodeFacts:
     """What the metrics see of an episode. route_length_m: of the reference route, the geodesic walkable length.
-    rules_broken: of events that were not passed as they should be."""
+    rules_broken: of events that were not passed as they should be. walked_into: contacts at a person's fault."""
 
     log: Log
     failures: tuple[Failure, ...]
@@ -39,6 +39,7 @@ class EpisodeFacts:
     ended: Ended | None
     route_length_m: float
     rules_broken: int = 0
+    walked_into: tuple[Failure, ...] = ()
 
 
 class Metric(NamedTuple):
@@ -187,6 +188,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_vehicle": Metric("", False, collisions_with("vehicle")),
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
+        "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
         "carriageway_time_s": Metric("s", False, carriageway_time_s),
         "vehicles_braked": Metric("", False, vehicles_braked),

@@ -4,12 +4,15 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
 
 - collision: the body touches anything but the ground, or its footprint overlaps a person's 0.3 m disk or a
   vehicle's box, at any physics substep. One event per thing until they have been apart for 1 s (people and
-  vehicles: more than 0.1 m apart; walls and objects: without contact).
+  vehicles: more than 0.1 m apart; walls and objects: without contact). Two things touched in one tick are two.
+- A person who walks into a robot of which no point has moved faster than 0.05 m/s for 1 s is at fault: that is counted
+  (`walked_into`), and no failure. A robot that drives on while that person touches it has collided.
 - out_of_lane: the base centre is outside the walkable area (sidewalks, corners, crossings).
-- freezing: for 10 s the robot was never 0.5 m away from where it was at their beginning; time of waiting before a
-  red crossing of the route does not count.
+- freezing, where the episode does not end on a failure: for 10 s the robot was never 0.5 m away from where it was at
+  their beginning; time of waiting before a red crossing of the route does not count. In a short episode waiting costs
+  nothing but its time.
 - Signals are judged on the crossings of the reference route, by arc length.
-- One failure a tick: collision before out_of_lane before freezing.
+- Failures of one kind a tick: collisions before out_of_lane before freezing; one reset for all of them.
 - Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2 s ends it well,
   passing the pedestrian ends it badly.
 - After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing nor
@@ -30,7 +33,7 @@ import numpy as np
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
-from cosim.core.state import PERSON_RADIUS_M, Contact, Signal
+from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, RobotState, Signal
 from cosim.episode.step import Reset, Step
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventState
@@ -50,6 +53,8 @@ _BEYOND_M = 1.0
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
 ROBOT_STANDS_MPS = 0.05
+STOOD_S = 1.0
+"""A robot that has stood for so long, slower than ROBOT_STANDS_MPS at every point of its outline, is walked into."""
 STOP_S = 2.0
 STOP_WITHIN_M = 3.0
 """Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
@@ -77,9 +82,11 @@ class Failure:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """What the referee says of one Step. red_light_entry: the crossing that was entered at red, if one was."""
+    """What the referee says of one Step. walked_into: contacts that people are at fault for, which are no failures.
+    red_light_entry: the crossing that was entered at red, if one was."""
 
-    failure: Failure | None = None
+    failures: tuple[Failure, ...] = ()
+    walked_into: tuple[Failure, ...] = ()
     reset: Reset | None = None
     ended: Literal["goal", "stop", "timeout", "failure"] | None = None
     red_light_entry: str | None = None
@@ -97,6 +104,8 @@ class Referee:
         self._route = scenario.route_line
         self._limit_ticks = clock.ticks(scenario.time_limit_s)
         self._touching: dict[str, int] = {}
+        self._walked_into: set[str] = set()
+        self._still_ticks = 0
         self._window: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
@@ -107,17 +116,20 @@ class Referee:
         """The verdict on one Step; a failure comes with a reset unless it ends the episode."""
         waits = self._waits_at_red(step)
         red = self._red_light_entry(step)
-        failure = self._collision(step) or self._out_of_lane(step) or self._freezing(step, waits)
-        if failure is None:
-            return Verdict(None, None, self._end(step), red, waits)
+        contacts = self._contacts(step)
+        into = tuple(contact for contact in contacts if contact.fault == "pedestrian_at_fault")
+        failures = tuple(contact for contact in contacts if contact.fault != "pedestrian_at_fault")
+        failures = failures or self._out_of_lane(step) or self._freezing(step, waits)
+        if not failures:
+            return Verdict((), into, None, self._end(step), red, waits)
         if self._scenario.ends_on_failure:
-            return Verdict(failure, None, "failure", red, waits)
+            return Verdict(failures, into, None, "failure", red, waits)
         if step.tick + 1 >= self._limit_ticks:
-            return Verdict(failure, None, "timeout", red, waits)
-        reset = self._reset(failure, step)
+            return Verdict(failures, into, None, "timeout", red, waits)
+        reset = self._reset(failures[0], step)
         self._window.clear()
         self._entered.clear()
-        return Verdict(failure, reset, None, red, waits)
+        return Verdict(failures, into, reset, None, red, waits)
 
     def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
         if self._scenario.ends_at == "stop":
@@ -142,18 +154,24 @@ class Referee:
             return "failure"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
 
-    def _collision(self, step: Step) -> Failure | None:
+    def _contacts(self, step: Step) -> list[Failure]:
+        """The contacts that begin in a tick, one for each thing."""
         self._forget_the_parted(step)
-        first: Contact | None = None
+        moves = outline_mps(step.robot, self._half_m) >= ROBOT_STANDS_MPS
+        self._still_ticks = 0 if moves else self._still_ticks + 1
+        stood = self._still_ticks >= self._clock.ticks(STOOD_S)
+        drives_on = self._walked_into if moves and step.command != STILL else set()
+        began: dict[str, Contact] = {}
         for contact in step.motion.contacts:
-            if contact.other not in self._touching and first is None:
-                first = contact
+            if contact.other not in self._touching or contact.other in drives_on:
+                began.setdefault(contact.other, contact)
             self._touching[contact.other] = step.tick
-        if first is None:
-            return None
-        speed_mps = step.robot.v_mps
-        fault = fault_of(first.other, speed_mps, step) if first.kind == "pedestrian" else None
-        return self._failure("collision", step, first.other, first.kind, fault)
+        found = []
+        for name, contact in began.items():
+            fault = fault_of(name, stood, step) if contact.kind == "pedestrian" else None
+            (self._walked_into.add if fault == "pedestrian_at_fault" else self._walked_into.discard)(name)
+            found.append(self._failure("collision", step, name, contact.kind, fault))
+        return found
 
     def _forget_the_parted(self, step: Step) -> None:
         """A thing may collide anew once it has been away for a second."""
@@ -165,30 +183,31 @@ class Referee:
                 self._touching[other] = step.tick
             elif (step.tick - last_tick) * self._clock.tick_s > _APART_S:
                 del self._touching[other]
+                self._walked_into.discard(other)
 
-    def _out_of_lane(self, step: Step) -> Failure | None:
+    def _out_of_lane(self, step: Step) -> tuple[Failure, ...]:
         pose = step.motion.robot.pose
         if self._inside.holds(pose.x_m, pose.y_m):
-            return None
+            return ()
         if not self._area.contains(pose.x_m, pose.y_m):
-            return self._failure("out_of_lane", step)
+            return (self._failure("out_of_lane", step),)
         room_m = float(self._area.signed_distance(pose.xy)[0]) - _ROUNDING_M
         self._inside = Circle(pose.x_m, pose.y_m, max(room_m, 0.0))
-        return None
+        return ()
 
-    def _freezing(self, step: Step, waits_at_red: bool) -> Failure | None:
-        if waits_at_red:
-            return None
+    def _freezing(self, step: Step, waits_at_red: bool) -> tuple[Failure, ...]:
+        if waits_at_red or self._scenario.ends_on_failure:
+            return ()
         self._window.append(step.motion.robot.pose[:2])
         if len(self._window) < (self._window.maxlen or 0):
-            return None
+            return ()
         # Mostly it is far from where it was, whatever lies between.
         if math.dist(self._window[0], self._window[-1]) > FREEZE_MOVE_M + _ROUNDING_M:
-            return None
+            return ()
         track = np.array(self._window)
         if np.hypot(*(track - track[0]).T).max() >= FREEZE_MOVE_M:
-            return None
-        return self._failure("freezing", step)
+            return ()
+        return (self._failure("freezing", step),)
 
     def _waits_at_red(self, step: Step) -> bool:
         return any(
@@ -279,9 +298,15 @@ def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> se
     return {vehicles.ids[i] for i in np.flatnonzero(near)}
 
 
-def fault_of(person: str, robot_speed_mps: float, step: Step) -> Fault:
-    """Who moved into whom: a robot slower than 0.05 m/s was walked into; a standing person was driven into."""
-    if abs(robot_speed_mps) < ROBOT_STANDS_MPS:
+def outline_mps(robot: RobotState, half_m: tuple[float, float]) -> float:
+    """How fast the fastest point of a robot's outline moves, at most."""
+    return abs(robot.v_mps) + abs(robot.w_radps) * math.hypot(*half_m)
+
+
+def fault_of(person: str, stood: bool, step: Step) -> Fault:
+    """Who moved into whom. stood: the robot has stood long enough to be walked into; a person who does not come nearer
+    is driven into."""
+    if stood:
         return "pedestrian_at_fault"
     people = step.street.people
     if person in people.ids:

@@ -52,6 +52,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
+    walked_into: contacts with people who walked into the robot where it stood; no failures.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
 
@@ -81,6 +82,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     state_hash: str = ""
     measures: dict[str, float | None] = {}
     failures: tuple[Failure, ...] = ()
+    walked_into: tuple[Failure, ...] = ()
     events: tuple[TriggeredEvent, ...] = ()
     injections: tuple[Injected, ...] = ()
     schema: int = _SCHEMA

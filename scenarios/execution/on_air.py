@@ -60,7 +60,8 @@ class OnAir:
         if step.frame is not None:
             self._rgb = step.frame.rgb
         tick, street, robot = step.tick, step.street_after, step.motion.robot
-        news = [f"{verdict.failure.kind} {verdict.failure.other}".strip()] if verdict.failure is not None else []
+        news = [f"{failure.kind} {failure.other}".strip() for failure in verdict.failures]
+        news += [f"walked into by {contact.other}" for contact in verdict.walked_into]
         for event, state in zip(self._scenario.events, step.events.states, strict=True):
             if state.phase == "acting" and event.id not in self._acting:
                 self._acting.add(event.id)

@@ -36,6 +36,7 @@ class Scorer:
         self._monitor = EventMonitor(scenario, kinds, clock.tick_ms)
         self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
+        self._walked_into: list[Failure] = []
         self._red_lights = 0
         self._verdict = Verdict()
 
@@ -44,8 +45,8 @@ class Scorer:
         verdict = self._verdict = self._referee.judge(step)
         self._recorder.add(step, verdict, self._traffic.see(step))
         self._monitor.see(step)
-        if verdict.failure is not None:
-            self._failures.append(verdict.failure)
+        self._failures += verdict.failures
+        self._walked_into += verdict.walked_into
         self._red_lights += verdict.red_light_entry is not None
         return verdict
 
@@ -54,7 +55,8 @@ class Scorer:
         scenario, log, events = self._scenario, self._recorder.log(self._monitor.tracks), self._monitor.outcomes()
         broken = sum(event.rule_met is False for event in events)
         ended, failures = self._verdict.ended, tuple(self._failures)
-        seen = EpisodeFacts(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken)
+        into = tuple(self._walked_into)
+        seen = EpisodeFacts(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken, into)
         reason = unseen(scenario, events)
         record = msgspec.structs.replace(
             begun,
@@ -65,6 +67,7 @@ class Scorer:
             state_hash=self._recorder.hash.hexdigest(),
             measures=every_metric(seen),
             failures=failures,
+            walked_into=into,
             events=events,
         )
         return record, log

@@ -136,7 +136,7 @@ def _watcher(job: Job, say: Hear) -> Watch:
 
     def watch(step: Step, verdict: Verdict) -> None:
         nonlocal failures, next_frame_s
-        failures += verdict.failure is not None
+        failures += len(verdict.failures)
         time_s = Clock().time_s(step.tick)
         if step.frame is not None and job.options.frames_every_s and time_s >= next_frame_s:
             import cv2

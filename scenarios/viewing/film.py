@@ -178,11 +178,12 @@ class _Reel:
             if state.phase == "acting" and event.id not in self._triggered:
                 self._triggered.add(event.id)
                 self._say(step.tick, event.kind.replace("_", " "), hud.INK)
-        if verdict.failure is not None:
-            kind = verdict.failure.kind
-            self._counts[kind] += 1
-            other = f" with {verdict.failure.other_kind}" if verdict.failure.other_kind else ""
-            self._say(step.tick, kind.replace("_", " ") + other, hud.BAD)
+        for failure in verdict.failures:
+            self._counts[failure.kind] += 1
+            other = f" with {failure.other_kind}" if failure.other_kind else ""
+            self._say(step.tick, failure.kind.replace("_", " ") + other, hud.BAD)
+        if verdict.walked_into:
+            self._say(step.tick, "walked into by pedestrian", hud.INK)
         if verdict.ended == "goal":
             self._say(step.tick, "goal", hud.GOOD)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -140,3 +142,10 @@ def test_resets_neither_hide_nor_invent_a_failure_to_progress() -> None:
     assert every_metric(episode(stands))["failure_to_progress"] == 4.0
     drives = [0.05 * (i + 1) for i in range(150)] + [0.05 * (i + 1) for i in range(150)]
     assert every_metric(episode(log(drives, resets={149: 0.0})))["failure_to_progress"] == 0.0
+
+
+def test_who_walks_into_a_robot_that_stands_is_counted_and_costs_it_nothing() -> None:
+    """At the goal after two such contacts: a success, no collision, and two contacts."""
+    facts = episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal")
+    measures = every_metric(replace(facts, walked_into=(failure("collision", "pedestrian"),) * 2))
+    assert [measures[name] for name in ("success", "collisions", "failures_per_100m", "walked_into")] == [1, 0, 0, 2]

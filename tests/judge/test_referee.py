@@ -14,6 +14,7 @@ from cosim.core.geometry import Pose
 from cosim.core.state import (
     NO_VEHICLES,
     STILL,
+    Command,
     Contact,
     Motion,
     People,
@@ -63,12 +64,14 @@ def step(
     red: Sequence[str] = (),
     cars: Vehicles = NO_VEHICLES,
     events: EventReply = NOTHING,
+    w_radps: float = 0.0,
+    command: Command = STILL,
 ) -> Step:
     """The robot ends the tick at (x, y), which is also its place on the route."""
-    robot = RobotState(Pose(x_m, y_m, 0.0), speed)
+    robot = RobotState(Pose(x_m, y_m, 0.0), speed, w_radps)
     street = Street(tick, who or people(), cars, {name: Signal(False) for name in red})
     motion = Motion(robot, write_protected([[x_m, y_m, 0.0]] * CLOCK.substeps), tuple(contacts))
-    return Step(tick, robot, street, x_m, None, STILL, events, motion, street, x_m)
+    return Step(tick, robot, street, x_m, None, command, events, motion, street, x_m)
 
 
 def judge_all(one: Referee, steps: Sequence[Step]) -> list[Verdict]:
@@ -83,45 +86,101 @@ def test_a_collision_is_one_event_until_they_have_been_apart() -> None:
     """A contact that lasts is counted once; after 1 s apart the same person counts again."""
     one = referee(ends_on_failure=False)
     far = people((50.0, 0.0))
-    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=far)).failure is not None
+    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=far)).failures
     held = [one.judge(step(t, 20.0 + t * 0.1, contacts=[touch("c0")], who=far)) for t in range(1, 30)]
-    assert all(v.failure is None for v in held)
+    assert not any(v.failures for v in held)
     apart = [one.judge(step(t, 20.0 + t * 0.1, who=far)) for t in range(30, 52)]
-    assert all(v.failure is None for v in apart)
-    again = one.judge(step(52, 30.0, contacts=[touch("c0")], who=far)).failure
-    assert again is not None and again.kind == "collision" and again.other == "c0"
+    assert not any(v.failures for v in apart)
+    again = one.judge(step(52, 30.0, contacts=[touch("c0")], who=far)).failures
+    assert [(one.kind, one.other) for one in again] == [("collision", "c0")]
 
 
 def test_someone_still_within_ten_centimetres_has_not_parted() -> None:
     """A person who stays near after a contact does not collide anew, however long it takes."""
     one = referee()
     near = people((20.0 + 0.35 + 0.3 + 0.05, 0.0))
-    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=near)).failure is not None
+    assert one.judge(step(0, 20.0, contacts=[touch("c0")], who=near)).failures
     for tick in range(1, 100):
         one.judge(step(tick, 20.0, who=near))
-    assert one.judge(step(100, 20.0, contacts=[touch("c0")], who=near)).failure is None
+    assert one.judge(step(100, 20.0, contacts=[touch("c0")], who=near)).failures == ()
 
 
 def test_the_fault_of_a_contact_follows_who_moved() -> None:
-    """A standing robot was walked into; a standing person was driven into; both moving share it."""
+    """A standing person was driven into; both moving share it, and so they do where the robot has only just stopped."""
 
     def fault(robot_mps: float, person_mps: float) -> str | None:
         who = people((20.5, 0.0), heading=math.pi, speed=person_mps)
-        failure = referee().judge(step(0, 20.0, contacts=[touch("c0")], who=who, speed=robot_mps)).failure
-        assert failure is not None
+        (failure,) = referee().judge(step(0, 20.0, contacts=[touch("c0")], who=who, speed=robot_mps)).failures
         return failure.fault
 
-    assert fault(0.0, 1.3) == "pedestrian_at_fault"
+    assert fault(0.0, 1.3) == "shared"
     assert fault(1.0, 0.0) == "robot_at_fault"
     assert fault(1.0, 1.3) == "shared"
+
+
+def stood(one: Referee, ticks: int, **speeds: float) -> None:
+    """The robot stands at x = 20, or turns there."""
+    for tick in range(ticks):
+        assert not one.judge(step(tick, 20.0, speed=0.0, **speeds)).failures
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_who_walks_into_a_robot_that_stands_is_at_fault_and_the_robot_has_not_failed(ends: bool) -> None:
+    """After 1 s of standing a contact is counted and nothing ends nor is reset; after less it is a collision, and after
+    1 s of turning on the spot too."""
+    who = people((20.5, 0.0), heading=math.pi, speed=1.3)
+    hit = {"contacts": [touch("c0")], "who": who, "speed": 0.0}
+    one = referee(ends_on_failure=ends)
+    stood(one, 19)
+    verdict = one.judge(step(19, 20.0, **hit))  # type: ignore[arg-type]
+    assert (verdict.failures, verdict.reset, verdict.ended) == ((), None, None)
+    assert [(into.fault, into.other) for into in verdict.walked_into] == [("pedestrian_at_fault", "c0")]
+    assert not one.judge(step(20, 20.0, **hit)).walked_into  # type: ignore[arg-type]
+    for ticks, w_radps in ((18, 0.0), (19, 0.3)):
+        other = referee(ends_on_failure=ends)
+        stood(other, ticks, w_radps=w_radps)
+        verdict = other.judge(step(ticks, 20.0, w_radps=w_radps, **hit))  # type: ignore[arg-type]
+        assert [failure.fault for failure in verdict.failures] == ["shared"] and not verdict.walked_into
+        assert (verdict.ended == "failure", verdict.reset is None) == (ends, ends)
+
+
+def test_a_robot_that_drives_on_through_who_has_walked_into_it_collides() -> None:
+    """Standing until one is touched buys nothing; a robot that is only pushed has not driven."""
+    who = people((20.5, 0.0))
+    hit = {"contacts": [touch("c0")], "who": who}
+    one = referee(ends_on_failure=True)
+    stood(one, 19)
+    assert one.judge(step(19, 20.0, speed=0.0, **hit)).walked_into  # type: ignore[arg-type]
+    assert not one.judge(step(20, 20.0, speed=0.2, **hit)).failures  # type: ignore[arg-type]
+    (failure,) = one.judge(step(21, 20.0, speed=0.2, command=Command(0.4, 0.0), **hit)).failures  # type: ignore[arg-type]
+    assert failure.fault == "robot_at_fault"
+
+
+def test_things_touched_in_one_tick_are_as_many_collisions_and_one_reset() -> None:
+    """Two people and a bin at once are three failures in the order of their contacts, one of them counted once."""
+    hit = [touch("c0"), touch("bin", "object"), touch("c0"), touch("c1")]
+    verdict = referee().judge(step(0, 23.0, contacts=hit, who=people((23.4, 0.0), (23.4, 0.4))))
+    assert [failure.other for failure in verdict.failures] == ["c0", "bin", "c1"]
+    assert verdict.reset is not None and verdict.ended is None
+    ended = referee(ends_on_failure=True).judge(step(0, 23.0, contacts=hit))
+    assert len(ended.failures) == 3 and ended.ended == "failure"
+
+
+def test_waiting_is_no_failure_where_an_episode_ends_on_one() -> None:
+    """Before its goal a robot may stand until the time is up; on a long way it freezes."""
+    for ends, ended in ((True, "timeout"), (False, "timeout")):
+        one = referee(ends_on_failure=ends, time_limit_s=60.0)
+        verdicts = judge_all(one, [step(t, 20.0, speed=0.0) for t in range(1200)])
+        assert sum(len(v.failures) for v in verdicts) == (0 if ends else 5)
+        assert verdicts[-1].ended == ended
 
 
 def test_out_of_lane_is_the_base_centre_outside_the_walkable_area() -> None:
     """At 1.99 m beside a 2 m half width nothing happens, at 2.01 m it does, and the robot is put back on the route."""
     one = referee()
-    assert one.judge(step(0, 23.0, 1.99)).failure is None
+    assert one.judge(step(0, 23.0, 1.99)).failures == ()
     verdict = one.judge(step(1, 23.0, 2.01))
-    assert verdict.failure is not None and verdict.failure.kind == "out_of_lane"
+    assert [failure.kind for failure in verdict.failures] == ["out_of_lane"]
     assert verdict.reset is not None and verdict.reset.pose == (25.0, 0.0, 0.0)
 
 
@@ -130,8 +189,7 @@ def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() 
     rng, one, y_m, told = np.random.default_rng(6), referee(), 0.0, []
     for tick in range(800):
         y_m = float(np.clip(y_m + rng.normal(0.0, 0.3) * rng.random() ** 3, -2.3, 2.3))
-        failure = one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failure
-        told.append(failure is not None)
+        told.append(bool(one.judge(step(tick, 20.0 + 0.05 * tick, y_m)).failures))
         assert told[-1] is not AREA.contains(20.0 + 0.05 * tick, y_m)
     assert 50 < sum(told) < 750
 
@@ -139,16 +197,16 @@ def test_out_of_lane_is_told_at_every_step_of_a_walk_to_and_fro_over_the_edge() 
 def test_freezing_is_half_a_metre_in_ten_seconds() -> None:
     """A robot that stands for 10 s freezes at once then; one that creeps 0.06 m/s does not; the count starts anew."""
     still = judge_all(referee(), [step(t, 20.0) for t in range(402)])
-    frozen_at = [t for t, v in enumerate(still) if v.failure is not None]
+    frozen_at = [t for t, v in enumerate(still) if v.failures]
     assert frozen_at == [200, 401]
     creeping = judge_all(referee(), [step(t, 20.0 + 0.06 * t * 0.05) for t in range(600)])
-    assert all(v.failure is None for v in creeping)
+    assert not any(v.failures for v in creeping)
 
 
 def test_going_to_and_fro_is_not_freezing() -> None:
     """A robot that went away and came back to the same spot within the window has moved."""
     track = [20.0 + 1.0 * math.sin(2 * math.pi * t / 200) for t in range(600)]
-    assert all(v.failure is None for v in judge_all(referee(), [step(t, x) for t, x in enumerate(track)]))
+    assert not any(v.failures for v in judge_all(referee(), [step(t, x) for t, x in enumerate(track)]))
 
 
 def test_waiting_before_a_red_crossing_is_not_freezing() -> None:
@@ -156,11 +214,11 @@ def test_waiting_before_a_red_crossing_is_not_freezing() -> None:
     crossing = RouteCrossing(id=":x_c0", enter_s_m=30.0, leave_s_m=40.0, signalised=True)
     one = referee(crossings=(crossing,))
     waiting = judge_all(one, [step(t, 29.0, red=[":x_c0"]) for t in range(500)])
-    assert all(v.failure is None and v.waits_at_red for v in waiting)
+    assert all(v.waits_at_red and not v.failures for v in waiting)
     green = judge_all(one, [step(t, 29.0) for t in range(500, 702)])
-    assert [t for t, v in enumerate(green) if v.failure is not None] == [200]
+    assert [t for t, v in enumerate(green) if v.failures] == [200]
     elsewhere = judge_all(referee(crossings=(crossing,)), [step(t, 20.0, red=[":x_c0"]) for t in range(202)])
-    assert elsewhere[200].failure is not None
+    assert elsewhere[200].failures
 
 
 def test_entering_a_crossing_at_red_is_noted_once() -> None:
@@ -209,13 +267,13 @@ def test_a_vehicle_collides_anew_only_after_it_has_been_away() -> None:
     one = referee()
     near = Vehicles.of(("v0",), [[20.0, 1.9]], [0.0], [0.0], [[4.5, 1.8]])
     hit = [Contact("vehicle", "v0", 0)]
-    assert one.judge(step(0, 20.0, contacts=hit)).failure is not None
+    assert one.judge(step(0, 20.0, contacts=hit)).failures
     for tick in range(1, 60):
         one.judge(step(tick, 20.0 + 0.001 * tick, 0.65, cars=near))
-    assert one.judge(step(60, 20.0, contacts=hit)).failure is None
+    assert one.judge(step(60, 20.0, contacts=hit)).failures == ()
     for tick in range(61, 90):
         one.judge(step(tick, 20.0 + 0.03 * tick))
-    assert one.judge(step(90, 25.0, contacts=hit)).failure is not None
+    assert one.judge(step(90, 25.0, contacts=hit)).failures
 
 
 def test_a_crossing_can_be_entered_at_red_after_it_was_left() -> None:
@@ -233,7 +291,7 @@ def test_time_before_and_after_a_red_signal_adds_up_to_freezing() -> None:
     one = referee(crossings=(crossing,))
     reds = [120 <= t < 400 for t in range(500)]
     verdicts = [one.judge(step(t, 29.0, red=[":x_c0"] if red else [])) for t, red in enumerate(reds)]
-    assert [t for t, v in enumerate(verdicts) if v.failure is not None] == [480]
+    assert [t for t, v in enumerate(verdicts) if v.failures] == [480]
 
 
 def test_the_episode_ends_at_the_goal_or_at_its_time() -> None:
@@ -256,8 +314,8 @@ def test_a_goal_near_the_start_of_a_round_route_counts_only_at_its_end() -> None
 @pytest.mark.parametrize("kind", ["vehicle", "wall", "object"])
 def test_every_kind_of_thing_can_be_collided_with(kind: str) -> None:
     """Walls, fences and vehicles are collisions too, without a pedestrian's fault class."""
-    failure = referee().judge(step(0, 20.0, contacts=[touch("b", kind)])).failure
-    assert failure is not None and (failure.other_kind, failure.fault) == (kind, None)
+    (failure,) = referee().judge(step(0, 20.0, contacts=[touch("b", kind)])).failures
+    assert (failure.other_kind, failure.fault) == (kind, None)
 
 
 def test_people_are_seen_from_the_footprint_not_from_the_centre() -> None:
@@ -305,4 +363,4 @@ def test_passing_the_hand_ends_the_episode_badly() -> None:
     one = referee(ends_at="stop", ends_on_failure=True, events=(event,))
     assert one.judge(step(0, 11.9, events=reply)).ended is None
     verdict = one.judge(step(1, 12.1, events=reply))
-    assert verdict.ended == "failure" and verdict.failure is None
+    assert verdict.ended == "failure" and not verdict.failures
