@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from cosim.core.errors import CosimError
     from cosim.core.state import Command
     from cosim.episode.log import Log
-    from cosim.episode.ports import BatchPolicy, CameraSpec, Manifest, Observation, Policy
+    from cosim.episode.ports import BatchPolicy, CameraSpec, Manifest, Observation, Policy, WaypointRule
     from cosim.policies.load import load_policy
     from cosim.records.record import Record
     from cosim.spec.options import EpisodeOptions
@@ -51,6 +51,7 @@ __all__ = [
     "Robot",
     "Scenario",
     "Suite",
+    "WaypointRule",
     "load_policy",
     "load_suite",
     "run",
@@ -72,6 +73,7 @@ _HOMES = {
     "Robot": "cosim.spec.robot",
     "Scenario": "cosim.spec.scenario",
     "Suite": "cosim.spec.scenario",
+    "WaypointRule": "cosim.episode.ports",
     "load_policy": "cosim.policies.load",
     "load_suite": "scenarios.catalog",
     "run": "scenarios.execution.suite_run",

@@ -1,6 +1,7 @@
-"""From a policy's answer to a command: checks, and the field's PD rule for waypoints.
+"""From a policy's answer to a command: checks, and the rules by which waypoints are followed.
 
-The rule is the one shipped with GNM, ViNT and NoMaD: v = dx / dt, w = atan2(dy, dx) / dt, clipped to the robot.
+The rules follow D. Shah et al., GNM (ICRA 2023), ViNT (CoRL 2023), and A. Sridhar et al., NoMaD (ICRA 2024), as their
+robots are driven: one waypoint of the answer, to be reached in one time step.
 """
 
 from __future__ import annotations
@@ -10,22 +11,30 @@ import math
 import numpy as np
 
 from cosim.core.errors import PolicyError
-from cosim.core.state import Command
+from cosim.core.state import STILL, Command
+from cosim.episode.ports import WaypointRule
 from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
 REAL_KINDS = "iuf"
 """The kinds of numpy that are real numbers: integers, unsigned, floating."""
 _MOST_SHOWN = 80
+_COLUMNS = (2, 4)
 
 
-def command_from_waypoint(dx_m: float, dy_m: float, dt_s: float) -> Command:
-    """The PD rule for one waypoint (x forward, y left) to be reached in `dt_s`; not yet clipped."""
-    if abs(dx_m) < EPS_M and abs(dy_m) < EPS_M:
-        return Command(0.0, 0.0)
-    if abs(dx_m) < EPS_M:
-        return Command(0.0, math.copysign(math.pi / (2.0 * dt_s), dy_m))
-    return Command(dx_m / dt_s, math.atan2(dy_m, dx_m) / dt_s)
+def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
+    """The command for one waypoint (x forward, y left), not yet clipped. heading_rad: the one it has, None for none.
+
+    At the robot's own place the heading is turned to, without one nothing is done. One exactly at its side is turned to
+    by a quarter. Else v = x / dt, and w = arctan(y / x) / dt (`shipped`) or atan2(y, x) / dt (`atan2`): these differ
+    behind the robot alone.
+    """
+    if abs(x_m) < EPS_M and abs(y_m) < EPS_M:
+        return STILL if heading_rad is None else Command(0.0, heading_rad / rule.dt_s)
+    if abs(x_m) < EPS_M:
+        return Command(0.0, math.copysign(math.pi / (2.0 * rule.dt_s), y_m))
+    bearing_rad = math.atan(y_m / x_m) if rule.rule == "shipped" else math.atan2(y_m, x_m)
+    return Command(x_m / rule.dt_s, bearing_rad / rule.dt_s)
 
 
 def clipped(command: Command, robot: Robot) -> Command:
@@ -34,11 +43,11 @@ def clipped(command: Command, robot: Robot) -> Command:
     return Command(min(max(command.v_mps, 0.0), robot.v_max_mps), w_radps)
 
 
-def command_of(answer: object, *, waypoint_dt_s: float, robot: Robot) -> Command:
-    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) of which the first is followed.
+def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
+    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which one is followed.
 
-    Raises PolicyError, saying what was answered, for NaN, infinities, and anything that is not real numbers of that
-    shape: truth values, texts and complex numbers are none.
+    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule needs, and anything
+    that is not real numbers of that shape: truth values, texts and complex numbers are none.
     """
     if isinstance(answer, Command):
         speeds = (answer.v_mps, answer.w_radps)
@@ -47,12 +56,13 @@ def command_of(answer: object, *, waypoint_dt_s: float, robot: Robot) -> Command
             shown = ", ".join(f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True))
             raise PolicyError(f"answered Command({shown}): both must be finite numbers")
         return clipped(Command(*numbers), robot)
-    dx_m, dy_m = _first_waypoint(answer)
-    return clipped(command_from_waypoint(dx_m, dy_m, waypoint_dt_s), robot)
+    x, y, *turn = _waypoint(answer, rule.index)
+    heading_rad = math.atan2(turn[1], turn[0]) if turn else None
+    return clipped(_followed(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
 
 
-def _first_waypoint(answer: object) -> tuple[float, float]:
-    """The first of waypoints (N, 2), all of which must be finite."""
+def _waypoint(answer: object, index: int) -> list[float]:
+    """One of waypoints (N, 2) or (N, 4), all of which must be finite."""
     try:
         array = np.asarray(answer)
     except (TypeError, ValueError) as error:  # rows of different lengths
@@ -61,14 +71,20 @@ def _first_waypoint(answer: object) -> tuple[float, float]:
         raise PolicyError(f"answered {_shown(answer)}: neither a Command nor waypoints")
     if array.dtype.kind not in REAL_KINDS:
         raise PolicyError(f"answered an array of {array.dtype.name}: waypoints are real numbers")
-    if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] != 2:
-        raise PolicyError(f"answered an array of shape {array.shape}: waypoints have shape (N, 2), N >= 1")
+    if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] not in _COLUMNS:
+        raise PolicyError(f"answered an array of shape {array.shape}: waypoints have shape (N, 2) or (N, 4), N >= 1")
     with np.errstate(over="ignore"):
         waypoints = array.astype(float)
     if not np.isfinite(waypoints).all():
         first = waypoints[~np.isfinite(waypoints).all(axis=1)][0].tolist()
         raise PolicyError(f"answered waypoints with NaN or infinity: {first}")
-    return float(waypoints[0, 0]), float(waypoints[0, 1])
+    if len(waypoints) <= index:
+        raise PolicyError(
+            f"answered waypoints of shape {array.shape}, and waypoint {index} (from 0) is followed: answer at least "
+            f"{index + 1}, or say which one in the manifest, as waypoints=WaypointRule(index={len(waypoints) - 1})"
+        )
+    row: list[float] = waypoints[index].tolist()
+    return row
 
 
 def _number(value: object) -> float:

@@ -88,7 +88,7 @@ class Driver:
         own = self._own(observation)
         with self._asked("act" if self._answered else "first act", observation.tick):
             answer = self._policy.act(own)
-            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, robot=own.robot)
+            command = command_of(answer, rule=self.manifest.waypoints, robot=own.robot)
         self._answered = True
         return command
 
@@ -168,7 +168,7 @@ class BatchDriver:
     def _command(self, answer: object, doing: PolicyCall, seen: Observation) -> Command | PolicyError:
         try:
             with self._driver._asked(doing, seen.tick):
-                return command_of(answer, waypoint_dt_s=self._driver.manifest.waypoint_dt_s, robot=seen.robot)
+                return command_of(answer, rule=self._driver.manifest.waypoints, robot=seen.robot)
         except PolicyError as error:
             return error
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -113,9 +114,46 @@ class Observation:
     episode: str = ""
 
 
+HowFollowed = Literal["shipped", "atan2"]
+
+
+@dataclass(frozen=True, slots=True)
+class WaypointRule:
+    """How a policy's waypoints become a command. The defaults are how GNM, ViNT and NoMaD drive their robots.
+
+    index: which waypoint is followed, from 0: the third of an answer. unit_m: metres in one unit of x and y. dt_s: the
+    time in which it is to be reached. rule: "shipped", v = x / dt and w = arctan(y / x) / dt, so that a waypoint behind
+    the robot turns it by less than a quarter; or "atan2", w = atan2(y, x) / dt, which turns it round. Both take a
+    waypoint at the robot's own place by its heading, if it has one (`cosim.episode.control`). Raises SpecError.
+
+    >>> WaypointRule(index=0, dt_s=0.2).in_words
+    'waypoint 0, units of 1 m, in 0.2 s, shipped'
+    """
+
+    index: int = 2
+    unit_m: float = 1.0
+    dt_s: float = 0.25
+    rule: HowFollowed = "shipped"
+
+    def __post_init__(self) -> None:
+        if isinstance(self.index, bool) or not isinstance(self.index, int) or self.index < 0:
+            raise SpecError(f"waypoints index must be a whole number from 0, not {self.index!r}")
+        for field in ("unit_m", "dt_s"):
+            value = getattr(self, field)
+            if not (math.isfinite(value) and value > 0.0):
+                raise SpecError(f"waypoints {field} must be a positive number, not {value}")
+        if self.rule not in get_args(HowFollowed):
+            raise SpecError(f"waypoints rule must be one of {', '.join(get_args(HowFollowed))}, not {self.rule!r}")
+
+    @property
+    def in_words(self) -> str:
+        """As tables tell it."""
+        return f"waypoint {self.index}, units of {self.unit_m:g} m, in {self.dt_s:g} s, {self.rule}"
+
+
 @dataclass(frozen=True, slots=True)
 class Manifest:
-    """What a policy says of itself. rate_hz: how often it acts; waypoint_dt_s: time between its waypoints.
+    """What a policy says of itself. rate_hz: how often it acts; waypoints: how those that it answers are followed.
 
     camera: what it sees by, None for a blind one; privileged: whether it is told what a camera does not show. Raises
     nothing itself: an episode refuses what cannot be, such as a rate of which a period is no whole number of ticks.
@@ -129,7 +167,7 @@ class Manifest:
     rate_hz: float = 4.0
     camera: CameraSpec | None = CameraSpec()
     privileged: bool = False
-    waypoint_dt_s: float = 0.25
+    waypoints: WaypointRule = WaypointRule()
 
 
 class Policy(Protocol):
@@ -153,7 +191,8 @@ class Policy(Protocol):
         """A new episode begins. Anything random must come from `seed`."""
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating]:
-        """A command, or waypoints (N, 2): x forward, y left, metres in the robot's frame."""
+        """A command, or waypoints in the robot's frame: (N, 2), x forward and y left, or (N, 4) with the cosine and the
+        sine of the heading there; the manifest's `WaypointRule` says which is followed, and how."""
 
 
 class BatchPolicy(Policy, Protocol):

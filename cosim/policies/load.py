@@ -109,8 +109,6 @@ def _wrong(manifest: Manifest) -> str:
     for field, text in (("name", manifest.name), ("version", manifest.version)):
         if not 0 < len(text) <= LONGEST_NAME or not text.isprintable() or "/" in text or text.startswith("."):
             return f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without '/', not {text!r:.80}"
-    if not (math.isfinite(manifest.waypoint_dt_s) and manifest.waypoint_dt_s > 0.0):
-        return f"waypoint_dt_s must be a positive number of seconds, not {manifest.waypoint_dt_s}"
     return "" if manifest.camera is None else _wrong_camera(manifest.camera)
 
 

@@ -18,7 +18,7 @@ from cosim.core.geometry import Floats
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
 from cosim.episode.log import Log
-from cosim.episode.ports import Manifest
+from cosim.episode.ports import Manifest, WaypointRule
 from cosim.episode.step import Step
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
@@ -53,6 +53,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     walked_into: contacts with people who walked into the robot where it stood; no failures.
+    waypoints: how those that it answers were followed.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
 
@@ -72,6 +73,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     policy: str
     policy_version: str
     policy_source: str = ""
+    waypoints: WaypointRule = WaypointRule()
     goal_protocol: str
     renderer: str
     versions: dict[str, str]
@@ -128,6 +130,7 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source
         policy=manifest.name,
         policy_version=manifest.version,
         policy_source=policy_source,
+        waypoints=manifest.waypoints,
         goal_protocol="route" if manifest.privileged else "none",
         renderer=NO_RENDERER,
         versions=versions(),

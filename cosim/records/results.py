@@ -15,7 +15,7 @@ from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
     "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "robot",
-    "policy", "policy_version", "goal_protocol", "renderer", "ticks", "state_hash",
+    "policy", "policy_version", "waypoints", "goal_protocol", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
@@ -26,6 +26,7 @@ WORST: dict[str, float] = {"success": 0.0, "goal_reached": 0.0, "route_completio
 def table_row(record: Record) -> dict[str, Any]:
     """One flat row. A function of scenario, policy and versions alone: wall times are left out."""
     row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
+    row["waypoints"] = record.waypoints.in_words
     row["metric_schema"] = metrics.SCHEMA
     row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {"done": record.measures, "crashed": WORST, "invalid": {}}

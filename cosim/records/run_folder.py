@@ -27,6 +27,7 @@ import pandas as pd
 
 from cosim.core.errors import MachineError, RunError, unknown, unwritable
 from cosim.core.whole_file import write_whole
+from cosim.episode.ports import WaypointRule
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
 from cosim.spec.scenario import Suite, write_suite
@@ -41,7 +42,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
-    "versions", "renderer", "counterfactual",
+    "versions", "renderer", "counterfactual", "waypoints",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -49,8 +50,9 @@ SAME = (
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
     counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
-    that the policy is written in (`cosim.policies.load.source_hash`). robots: which drive, and the hash of each.
-    shared_renderer: whether one process drew for all others when it began; what comes out is the same."""
+    that the policy is written in (`cosim.policies.load.source_hash`); waypoints: how those it answers are followed.
+    robots: which drive, and the hash of each. shared_renderer: whether one process drew for all others when it began;
+    what comes out is the same."""
 
     suite: str
     robots: dict[str, str]
@@ -60,6 +62,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_name: str
     policy_version: str
     policy_source: str = ""
+    waypoints: WaypointRule = WaypointRule()
     scenarios: tuple[str, ...]
     versions: dict[str, str]
     renderer: str = "unknown"
@@ -338,5 +341,5 @@ def _trouble(path: Path, error: sqlite3.Error) -> RunError | MachineError:
 
 
 def _brief(value: object) -> str:
-    text = str(value)
+    text = str(getattr(value, "in_words", value))
     return text if len(text) <= 80 else text[:77] + "..."

@@ -171,7 +171,7 @@ class Episode:
         if self.over:
             raise UsageError(f"this Episode is over ({self._verdict.ended}): ask for its result(), or make another")
         try:
-            command = command_of(answer, waypoint_dt_s=self.manifest.waypoint_dt_s, robot=stage.robot)
+            command = command_of(answer, rule=self.manifest.waypoints, robot=stage.robot)
         except PolicyError as error:
             raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
         frame = self._frame

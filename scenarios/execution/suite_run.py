@@ -110,6 +110,7 @@ def run_spec(
         policy_name=manifest.name,
         policy_version=manifest.version,
         policy_source=driver.source_hash,
+        waypoints=manifest.waypoints,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
         renderer=renderer_of(chosen_camera(options.camera)) if manifest.camera is not None else NO_RENDERER,

@@ -2,35 +2,103 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, SpecError
 from cosim.core.state import Command
-from cosim.episode.control import command_from_waypoint, command_of
-from cosim.spec.robot import COURIER
+from cosim.episode.control import command_of
+from cosim.episode.ports import WaypointRule
+from cosim.spec.robot import COURIER, Robot
+
+ATAN2 = WaypointRule(rule="atan2")
+QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
+"""Turns as fast as it is told."""
 
 
-def of(answer: object) -> Command:
-    return command_of(answer, waypoint_dt_s=0.25, robot=COURIER)
+def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:  # noqa: B008  frozen
+    return command_of(answer, rule=rule, robot=robot)
 
 
-def test_a_waypoint_becomes_the_fields_pd_command() -> None:
-    """v = dx / dt and w = atan2(dy, dx) / dt; a waypoint at the side turns on the spot; none stands still."""
-    assert command_from_waypoint(0.5, 0.1, 0.25) == Command(2.0, math.atan2(0.1, 0.5) / 0.25)
-    assert command_from_waypoint(0.0, -1.0, 0.25) == Command(0.0, -math.pi / 0.5)
-    assert command_from_waypoint(0.0, 0.0, 0.25) == Command(0.0, 0.0)
+# x, y, heading (None without one), then w by the shipped rule and by atan2, worked out by hand for a step of 0.25 s.
+BY_HAND = {
+    "ahead": (0.5, 0.0, None, 0.0, 0.0),
+    "ahead-left": (0.5, 0.5, None, math.pi, math.pi),  # 45 degrees in a quarter of a second
+    "ahead-right": (0.3, -0.3 * math.sqrt(3.0), None, -4.0 * math.pi / 3.0, -4.0 * math.pi / 3.0),  # -60 degrees
+    "behind-left": (-1.0, 0.5, None, -1.8545904360032244, 10.711780178355947),  # arctan(-1/2) = -0.4636; pi - 0.4636
+    "behind-right": (-1.0, -0.5, None, 1.8545904360032244, -10.711780178355947),
+    "straight-behind": (-1.0, 0.0, None, 0.0, 4.0 * math.pi),
+    "left": (0.0, 1.0, None, 2.0 * math.pi, 2.0 * math.pi),
+    "right-with-heading": (0.0, -1.0, 1.0, -2.0 * math.pi, -2.0 * math.pi),  # the heading counts at its own place alone
+    "here": (0.0, 0.0, None, 0.0, 0.0),
+    "here-turned-left": (0.0, 0.0, 0.5, 2.0, 2.0),
+    "here-turned-right": (1e-9, -1e-9, -2.0, -8.0, -8.0),
+    "ahead-with-heading": (0.5, 0.5, -1.0, math.pi, math.pi),
+}
+
+
+@pytest.mark.parametrize("name", BY_HAND)
+@pytest.mark.parametrize("rule", [WaypointRule(), ATAN2], ids=["shipped", "atan2"])
+def test_both_rules_turn_as_worked_out_by_hand(name: str, rule: WaypointRule) -> None:
+    """v is x / dt, never backwards; w is that of the rule; only behind the robot the two differ."""
+    x_m, y_m, heading_rad, shipped, atan2 = BY_HAND[name]
+    row = [x_m, y_m] if heading_rad is None else [x_m, y_m, math.cos(heading_rad), math.sin(heading_rad)]
+    v_mps = 4.0 * x_m if x_m > 1e-8 else 0.0
+    expected = (v_mps, shipped if rule is not ATAN2 else atan2)
+    assert dataclasses.astuple(of([[9.0] * len(row), [9.0] * len(row), row], rule, QUICK)) == pytest.approx(expected)
+
+
+def test_a_waypoint_behind_the_robot_turns_it_as_the_models_were_driven() -> None:
+    """(-1, 0.5) at 0.25 s: -1.85 rad/s by the shipped rule, clipped to the courier's -0.65; by atan2 to +0.65."""
+    answer = [[-1.0, 0.5]] * 3
+    assert of(answer, robot=QUICK).w_radps == pytest.approx(-1.85, abs=0.005)
+    assert of(answer) == Command(0.0, -0.65) and of(answer, ATAN2) == Command(0.0, 0.65)
+
+
+def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> None:
+    """The third one unless it says otherwise; x and y times the unit, in the step that is declared."""
+    answer = np.array([[0.1, 0.0], [0.2, 0.1], [0.4, 0.0], [0.5, 0.5]])
+    assert of(answer) == Command(1.6, 0.0)
+    assert of(answer, WaypointRule(index=0)) == Command(0.4, 0.0)
+    assert of(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(0.5, math.pi / 2.0)
+    scaled = WaypointRule(index=0, unit_m=10.0)
+    assert of([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == of([[1e-8, 1e-8, 0.0, 1.0]], WaypointRule(index=0), QUICK)
+
+
+def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> None:
+    """Two waypoints, and the third is followed."""
+    with pytest.raises(PolicyError) as caught:
+        of([[0.1, 0.0], [0.2, 0.0]])
+    assert str(caught.value) == (
+        "answered waypoints of shape (2, 2), and waypoint 2 (from 0) is followed: answer at least 3, or say which one "
+        "in the manifest, as waypoints=WaypointRule(index=1)"
+    )
+
+
+@given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0), st.floats(-math.pi, math.pi))
+def test_the_rules_agree_before_the_robot_and_never_leave_its_limits(x_m: float, y_m: float, heading: float) -> None:
+    """For any waypoint: within the limits; ahead of the robot the same by both; mirrored, it turns the other way."""
+    row, mirrored = ((x_m, side * y_m, math.cos(heading), side * math.sin(heading)) for side in (1.0, -1.0))
+    one, other = of([row] * 3), of([row] * 3, ATAN2)
+    for command in (one, other):
+        assert 0.0 <= command.v_mps <= COURIER.v_max_mps and abs(command.w_radps) <= COURIER.w_max_radps
+    assert one == other or x_m < 0.0
+    turned = of([mirrored] * 3)
+    assert turned.v_mps == one.v_mps and turned.w_radps == -one.w_radps
 
 
 def test_commands_are_clipped_to_the_robot() -> None:
     """Speeds beyond the robot's, and driving backwards, are clipped."""
     assert of(Command(9.0, -9.0)) == Command(2.5, -0.65)
     assert of(Command(-1.0, 0.1)) == Command(0.0, 0.1)
-    assert of(np.array([[0.1, 0.0], [0.2, 0.0]])) == Command(0.4, 0.0)
-    assert of([[0.1, 0.0]]) == Command(0.4, 0.0)
+    assert of(np.array([[9.0, 9.0], [9.0, 9.0], [9.0, 0.0]])) == Command(2.5, 0.0)
+    assert of([[0.0, 0.0], [0.0, 0.0], [0.1, 0.0]]) == Command(0.4, 0.0)
 
 
 UNUSABLE: dict[str, tuple[object, str]] = {
@@ -45,7 +113,7 @@ UNUSABLE: dict[str, tuple[object, str]] = {
     "nan-waypoint": (np.array([[math.nan, 0.0]]), "waypoints with NaN or infinity: [nan, 0.0]"),
     "nan-later": (np.array([[1.0, 0.0], [math.inf, 0.0]]), "waypoints with NaN or infinity: [inf, 0.0]"),
     "huge-waypoint": ([[10**400, 0]], "an array of object: waypoints are real numbers"),
-    "one-row": (np.zeros((3,)), "an array of shape (3,): waypoints have shape (N, 2)"),
+    "one-row": (np.zeros((3,)), "an array of shape (3,): waypoints have shape (N, 2) or (N, 4)"),
     "no-row": (np.zeros((0, 2)), "an array of shape (0, 2)"),
     "three-columns": (np.zeros((4, 3)), "an array of shape (4, 3)"),
     "ragged": ([[1.0, 0.0], [1.0]], "neither a Command nor waypoints"),
@@ -77,9 +145,9 @@ def test_numbers_of_every_kind_are_commands() -> None:
     """Integers and numpy's numbers of any width are read once, as floats."""
     assert of(Command(1, np.float32(0.5))) == Command(1.0, 0.5)
     assert of(Command(np.int64(1), np.float16(0.5))) == Command(1.0, 0.5)
-    assert of(np.array([[1, 0]], dtype=np.uint8)) == Command(2.5, 0.0)
-    assert of(np.array([[0.1, 0]], dtype=np.longdouble)) == Command(0.4, 0.0)
-    assert of([(0.1, 0.0)]) == Command(0.4, 0.0)
+    assert of(np.array([[1, 0]] * 3, dtype=np.uint8)) == Command(2.5, 0.0)
+    assert of(np.array([[0.1, 0]] * 3, dtype=np.longdouble)) == Command(0.4, 0.0)
+    assert of([(0.1, 0.0)] * 3) == Command(0.4, 0.0)
 
 
 def test_a_clock_counts_in_whole_periods() -> None:

@@ -17,7 +17,7 @@ from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
 from cosim.episode.driver import BatchDriver, Driver, PolicyCall
-from cosim.episode.ports import Manifest, Observation, Privileged
+from cosim.episode.ports import Manifest, Observation, Privileged, WaypointRule
 from cosim.spec.robot import COURIER
 
 MINE = Manifest("mine", camera=None)
@@ -180,7 +180,7 @@ def test_a_manifest_is_read_once() -> None:
 
     def greedy(observation: Observation) -> Command:
         known.append(observation.privileged)
-        policy.manifest = Manifest("mine", camera=None, privileged=True, waypoint_dt_s=1e-9)
+        policy.manifest = Manifest("mine", camera=None, privileged=True, waypoints=WaypointRule(dt_s=1e-9))
         return STILL
 
     policy = Fake(greedy)
@@ -245,7 +245,7 @@ def test_a_batch_is_answered_in_its_order() -> None:
         Command(0.2, COURIER.w_max_radps),
         Command(0.4, COURIER.w_max_radps),
     ]
-    assert of_two(lambda two: np.array([[[0.1, 0.0]], [[0.2, 0.0]]])) == [Command(0.4, 0.0), Command(0.8, 0.0)]
+    assert of_two(lambda two: np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3])) == [Command(0.4, 0.0), Command(0.8, 0.0)]
 
 
 def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:

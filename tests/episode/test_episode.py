@@ -81,7 +81,7 @@ def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> N
         with pytest.raises(EngineError, match="already running in this process"), Episode(scenario, SEEING):
             pass
         while not episode.over:
-            episode.advance(np.array([[0.2, 0.0]]))
+            episode.advance(np.array([[0.2, 0.0]] * 3))
         with pytest.raises(UsageError, match=r"is over \(timeout\): ask for its result\(\)"):
             episode.advance(AHEAD)
     with pytest.raises(UsageError, match="is closed: make another"):

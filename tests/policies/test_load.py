@@ -15,7 +15,7 @@ from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
 
 GOOD = """
-from cosim.episode.ports import CameraSpec, Manifest
+from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
 from cosim.core.state import STILL
 from cosim.spec.robot import Mount
 class Mine:
@@ -43,7 +43,19 @@ BAD = {
     "rate-zero": (GOOD.replace("{fields}", ", rate_hz=0"), "a policy rate must be positive"),
     "rate-nan": (GOOD.replace("{fields}", ", rate_hz=float('nan')"), "a policy rate must be positive"),
     "rate-7": (GOOD.replace("{fields}", ", rate_hz=7"), "usual policy rates are 4, 5, 10, 20 Hz"),
-    "waypoints-now": (GOOD.replace("{fields}", ", waypoint_dt_s=0.0"), "waypoint_dt_s must be a positive number"),
+    "waypoints-now": (
+        GOOD.replace("{fields}", ", waypoints=WaypointRule(dt_s=0.0)"),
+        "waypoints dt_s must be a positive number, not 0.0",
+    ),
+    "waypoint-from-the-end": (
+        GOOD.replace("{fields}", ", waypoints=WaypointRule(index=-1)"),
+        "waypoints index must be a whole number from 0, not -1",
+    ),
+    "waypoints-by-magic": (
+        GOOD.replace("{fields}", ", waypoints=WaypointRule(rule='magic')"),
+        "waypoints rule must be one of shipped, atan2, not 'magic'",
+    ),
+    "waypoints-as-number": (GOOD.replace("{fields}", ", waypoints=2"), "its manifest: Expected `object`, got `int`"),
     "no-pixels": (GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"), "sides of 1 to 4096 pixels, not 0 x 96"),
     "fish-eye": (GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"), "fov_deg must be between 0 and 180"),
     "lost-mount": (

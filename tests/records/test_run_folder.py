@@ -15,9 +15,10 @@ import pytest
 
 from cosim.core.errors import RunError, UsageError
 from cosim.episode.log import Log
+from cosim.episode.ports import WaypointRule
 from cosim.judge.metrics import METRICS
 from cosim.records.record import Record
-from cosim.records.results import summary_of, table_of
+from cosim.records.results import summary_of, table_of, table_row
 from cosim.records.run_folder import RunFolder, RunSpec, read_records, read_spec
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
@@ -110,6 +111,7 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("renderer", "other"),
         ("versions", {"numpy": "1"}),
         ("counterfactual", True),
+        ("waypoints", WaypointRule(rule="atan2")),
     ],
 )
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
@@ -119,6 +121,28 @@ def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, val
     other = msgspec.structs.replace(SPEC, **{field: value})
     with pytest.raises(RunError, match=f"is of another run: its {field} is"):
         RunFolder.resume(tmp_path / "run", other)
+
+
+def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
+    """The one of the run, and the one that is asked for now."""
+    with RunFolder.create(tmp_path / "run", SPEC, SUITE):
+        pass
+    other = msgspec.structs.replace(SPEC, waypoints=WaypointRule(index=0, dt_s=0.2, rule="atan2"))
+    with pytest.raises(RunError) as caught:
+        RunFolder.resume(tmp_path / "run", other)
+    assert (
+        "its waypoints is waypoint 2, units of 1 m, in 0.25 s, shipped, now asked for is waypoint 0, units of 1 m, "
+        "in 0.2 s, atan2. Resume with the same command"
+    ) in str(caught.value)
+
+
+def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:
+    """From the record, which holds the rule itself."""
+    scaled = msgspec.structs.replace(record("s-0"), waypoints=WaypointRule(index=4, unit_m=0.25))
+    scaled.save(tmp_path / "record.json")
+    kept = Record.load(tmp_path / "record.json")
+    assert kept.waypoints == WaypointRule(index=4, unit_m=0.25)
+    assert table_row(kept)["waypoints"] == "waypoint 4, units of 0.25 m, in 0.25 s, shipped"
 
 
 def test_resuming_with_an_edited_policy_is_refused(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from cosim.core.errors import EngineError
 from cosim.core.state import Command, Signal
-from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.episode.ports import CameraSpec, Manifest, Observation, WaypointRule
 
 HERE = Path(os.environ.get("HOSTILE_DESK", ".")).absolute()
 WALK = Command(1.0, 0.0)
@@ -206,7 +206,7 @@ def nan(self: Hostile, seen: Observation) -> object:
 
 @act
 def infinity(self: Hostile, seen: Observation) -> object:
-    return [[float("inf"), 0.0]]
+    return [[float("inf"), 0.0]] * 3
 
 
 @act
@@ -292,7 +292,7 @@ def scribbles(self: Hostile, seen: Observation) -> object:
 
 @act
 def another_manifest(self: Hostile, seen: Observation) -> object:
-    self.manifest = Manifest("somebody", rate_hz=20.0, waypoint_dt_s=1e-6)
+    self.manifest = Manifest("somebody", rate_hz=20.0, waypoints=WaypointRule(dt_s=1e-6))
     type(self).manifest = self.manifest
     return WALK
 

@@ -19,7 +19,7 @@ from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, Signal, Street
 from cosim.episode.control import command_of
 from cosim.episode.driver import Driver
-from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged
+from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.policies.body import BodyDisks
@@ -134,7 +134,7 @@ def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -
     for name, share in paces.items():
         policy = POLICIES[name]()
         policy.reset("t", 0)
-        command = command_of(policy.act(seen(robot)), waypoint_dt_s=0.25, robot=robot)
+        command = command_of(policy.act(seen(robot)), rule=WaypointRule(), robot=robot)
         assert command.v_mps == pytest.approx(share * robot.cruise_mps, rel=1e-3), name
         policy.reset("t", 0)
         turned = policy.act(seen(robot, heading_rad=-1.0))
@@ -171,8 +171,8 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
 
 def test_answers_are_clipped_to_the_robot_that_drives() -> None:
     """A command and a waypoint beyond what the third robot can."""
-    for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]])):
-        assert command_of(answer, waypoint_dt_s=0.25, robot=BARROW) == Command(1.0, -0.4)
+    for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]] * 3)):
+        assert command_of(answer, rule=WaypointRule(), robot=BARROW) == Command(1.0, -0.4)
 
 
 @EVERY
