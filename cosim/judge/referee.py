@@ -15,9 +15,9 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
 - Failures of one kind a tick: collisions before out_of_lane before freezing; one reset for all of them.
 - Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2 s ends it well,
   passing the pedestrian ends it badly.
-- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing nor
-  at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at least 1 m
-  beyond them.
+- After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing, at an
+  obstacle nor at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at
+  least 1 m beyond them.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -30,6 +30,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+import shapely
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
@@ -37,6 +38,7 @@ from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, RobotState, Signal
 from cosim.episode.step import Reset, Step
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventState
+from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
 FREEZE_WINDOW_S = 10.0
@@ -47,6 +49,7 @@ _APART_S = 1.0
 WAYPOINT_STEP_M = 5.0
 FREE_OF_PEOPLE_M = 1.0
 FREE_OF_VEHICLES_M = 4.0
+FREE_OF_OBSTACLES_M = 0.1
 _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
@@ -102,6 +105,7 @@ class Referee:
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._clock = clock
         self._route = scenario.route_line
+        self._obstacles = shapely.union_all([footprint(obstacle) for obstacle in scenario.obstacles])
         self._limit_ticks = clock.ticks(scenario.time_limit_s)
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
@@ -240,8 +244,10 @@ class Referee:
         stuck = len(recent) == SAME_PLACE_FAILURES and max(recent) - min(recent) <= _SAME_PLACE_M
         count = int(self._route.length_m // WAYPOINT_STEP_M) + 1
         last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
-        waypoints = np.arange(count) * WAYPOINT_STEP_M
+        waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
         waypoints = waypoints[waypoints <= last_m]
+        if self._scenario.obstacles:
+            waypoints = self._clear(waypoints)
         if stuck:
             self._failed_at_s.clear()
             order = waypoints[waypoints > max(recent) + _BEYOND_M]
@@ -253,6 +259,12 @@ class Referee:
                 return Reset(pose, float(s_m))
         s_m = float(waypoints[np.argmin(np.abs(waypoints - failure.route_s_m))])
         return Reset(self._route.at(s_m), s_m)
+
+    def _clear(self, waypoints: Floats) -> Floats:
+        """Those at which the robot can turn on the spot between the obstacles; all where there is none."""
+        at = shapely.points([self._route.at(s_m).xy for s_m in waypoints.tolist()])
+        clear = waypoints[shapely.distance(at, self._obstacles) > math.hypot(*self._half_m) + FREE_OF_OBSTACLES_M]
+        return clear if len(clear) else waypoints
 
     def _free(self, pose: Pose, s_m: float, step: Step) -> bool:
         if any(c.enter_s_m - self._half_m[0] < s_m < c.leave_s_m + self._half_m[0] for c in self._scenario.crossings):

@@ -19,6 +19,7 @@ from cosim.episode.log import Log
 from cosim.place.street_map import Lane, StreetMap
 from cosim.records.record import Record
 from cosim.report.legend import Image, Rgb255, legend, wide_px
+from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
 _MARGIN_M: Final = 25.0
@@ -42,6 +43,7 @@ _CROSSING: Final[Rgb255] = (250, 250, 190)
 ROUTE: Final[Rgb255] = (60, 120, 220)
 TRACK: Final[Rgb255] = (20, 20, 20)
 BARRIER: Final[Rgb255] = (210, 30, 30)
+OBSTACLE: Final[Rgb255] = (120, 80, 40)
 PERSON: Final[Rgb255] = (150, 120, 190)
 EVENT: Final[Rgb255] = (230, 120, 0)
 RESIDENT: Final[Rgb255] = (0, 140, 110)
@@ -125,6 +127,8 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
         across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
         middle = np.array([barrier.x_m, barrier.y_m])
         sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
+    for obstacle in scenario.obstacles:
+        sheet.area(footprint(obstacle), OBSTACLE)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.CROWD], PERSON, 0.15)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.RESIDENT], RESIDENT, 0.2)
     sheet.dot(log.people_xy[np.isin(log.people_kind, DIRECTED)], EVENT, 0.25)
@@ -186,6 +190,7 @@ def _facts(scenario: Scenario, record: Record, time_s: float) -> list[tuple[str,
         ("route", ROUTE),
         ("track", TRACK),
         ("barriers", BARRIER),
+        *([("obstacles", OBSTACLE)] if scenario.obstacles else []),
         ("people", PERSON),
         ("events", EVENT),
         *([("residents", RESIDENT)] if scenario.crowd.residents else []),

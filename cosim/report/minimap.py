@@ -12,8 +12,19 @@ import shapely
 from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People, RobotState, Street
 from cosim.place.street_map import StreetMap
-from cosim.report.above import BARRIER, EVENT, GROUND_COLOUR, PERSON, RESIDENT, ROUTE, Sheet, draw_streets
+from cosim.report.above import (
+    BARRIER,
+    EVENT,
+    GROUND_COLOUR,
+    OBSTACLE,
+    PERSON,
+    RESIDENT,
+    ROUTE,
+    Sheet,
+    draw_streets,
+)
 from cosim.report.legend import Image, Rgb255
+from cosim.spec.obstacle import footprint
 from cosim.spec.scenario import Scenario
 
 MINIMAP_REACH_M: Final = 11.0
@@ -50,6 +61,8 @@ class Minimap:
             across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
             middle = np.array([barrier.x_m, barrier.y_m])
             sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.4)
+        for obstacle in scenario.obstacles:
+            sheet.area(footprint(obstacle), OBSTACLE)
         sheet.dot(np.array([scenario.goal]), ROUTE, 0.7)
         sheet.dot(np.array([scenario.goal]), (255, 255, 255), 0.3)
         self._streets, self._footprint = sheet, np.array(footprint_m)

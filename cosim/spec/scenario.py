@@ -20,6 +20,7 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.ranges import ALONG_M, HEADING_RAD, SEED, WHERE_M, Counted, Named, Points, Ranged, Text, Within, shown
 from cosim.spec.robot import COURIER, robot_called
 from cosim.spec.spec_file import in_lines, read_spec_file
@@ -201,6 +202,7 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     route: Annotated[tuple[tuple[float, float], ...], Counted(0, 50_000), Points(WHERE_M.low, WHERE_M.high)]
     crossings: Annotated[tuple[RouteCrossing, ...], Counted(0, 1000)] = ()
     barriers: Annotated[tuple[Barrier, ...], Counted(0, 1000)] = ()
+    obstacles: Annotated[tuple[Obstacle, ...], Counted(0, 1000)] = ()
     events: Annotated[tuple[Event, ...], Counted(0, 200)] = ()
     crowd: CrowdSpec = CrowdSpec()
     robot: Annotated[str, _NAME] = COURIER.name

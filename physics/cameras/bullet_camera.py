@@ -43,7 +43,7 @@ class BulletCamera(WorldCamera):
     def __enter__(self) -> Self:
         if self._canvas is None:
             self._canvas = BulletCanvas(self._egl)
-            self._scene = BulletScene(self._canvas, self._world.surface, self._world.barriers, self._world.robot)
+            self._scene = BulletScene(self._canvas, self._world)
         return self
 
     def close(self) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,8 +10,6 @@ import numpy as np
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats, Pose
 from cosim.core.state import People, Street, Vehicles
-from cosim.spec.robot import Robot
-from cosim.spec.scenario import Barrier
 from physics.cameras.canvas import BulletCanvas, Rigs
 from physics.cameras.view import FORGET_M, PERSON_MARGIN_M, PROP_MARGIN_M, VEHICLE_MARGIN_M, VISIBLE_M, View
 from physics.people.families import FAMILIES
@@ -23,8 +20,9 @@ from physics.street import props, vehicles
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.layers import Colour
-from physics.world.surface import Surface
+from physics.world.surface import stood
 from physics.world.tiles import Key, distance_to, keys_within, square
+from physics.world.world import BulletWorld
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,10 +43,10 @@ class BulletScene:
     built: number of tiles made since the start.
     """
 
-    def __init__(self, canvas: BulletCanvas, surface: Surface, barriers: Sequence[Barrier], model: Robot) -> None:
+    def __init__(self, canvas: BulletCanvas, world: BulletWorld) -> None:
         self._canvas = canvas
-        self._surface = surface
-        self._model = model
+        self._surface = surface = world.surface
+        self._model = world.robot
         self._tiles: dict[Key, _TileBodies] = {}
         self._shown: set[Key] = set()
         self.built = 0
@@ -58,8 +56,9 @@ class BulletScene:
         self._vehicles: dict[tuple[vehicles.Shape, float, float], Rigs] = {}
         self._furniture: dict[tuple[str, int, int], Rigs] = {}
         self._painted: dict[int, Colour] = {}
-        self._robot = canvas.load(urdf_of(model), "robot")
-        for barrier in barriers:
+        self._robot = canvas.load(urdf_of(world.robot), "robot")
+        self._obstacles = _with_furniture({}, [], tuple(stood(world.obstacles, surface)))
+        for barrier in world.barriers:
             size = (barrier.thickness_m, barrier.length_m)
             z = surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
             for mesh, colour in zip(props.barrier_meshes(barrier), (props.PROP_RED, props.PROP_WHITE), strict=True):
@@ -115,9 +114,7 @@ class BulletScene:
         }
         for post in posts:
             bodies[self._canvas.add(self._post, props.POLE, "signal")] = self._foot(post), post.heading_rad
-        xy = np.array([(prop.x_m, prop.y_m) for prop, _ in chunk.props]).reshape(-1, 2)
-        seen_m = np.array([KINDS[prop.kind].seen_m for prop, _ in chunk.props])
-        return _TileBodies(bodies, posts, chunk.props, xy, seen_m)
+        return _with_furniture(bodies, posts, chunk.props)
 
     def _foot(self, post: props.SignalPost) -> tuple[float, float, float]:
         return post.x_m, post.y_m, float(self._surface.heights([[post.x_m, post.y_m]])[0])
@@ -178,8 +175,7 @@ class BulletScene:
         """Props are lent their bodies like people: those out of the picture or far away cost nothing."""
         for rigs in self._furniture.values():
             rigs.start()
-        for key in sorted(self._shown):
-            tile = self._tiles[key]
+        for tile in (*(self._tiles[key] for key in sorted(self._shown)), self._obstacles):
             if not tile.furniture:
                 continue
             rows = view.rows(tile.furniture_xy, PROP_MARGIN_M)
@@ -198,3 +194,12 @@ class BulletScene:
                         self._canvas.paint(body, colour)
         for rigs in self._furniture.values():
             rigs.finish()
+
+
+def _with_furniture(
+    bodies: dict[int, tuple[tuple[float, float, float], float]],
+    posts: list[props.SignalPost],
+    furniture: tuple[tuple[Prop, float], ...],
+) -> _TileBodies:
+    xy = np.array([(prop.x_m, prop.y_m) for prop, _ in furniture]).reshape(-1, 2)
+    return _TileBodies(bodies, posts, furniture, xy, np.array([KINDS[prop.kind].seen_m for prop, _ in furniture]))

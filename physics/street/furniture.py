@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -11,7 +12,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from cosim.spec.obstacle import OBSTACLE_SIZES_M, OBSTACLE_VARIANTS, Obstacle, ObstacleKind
 from physics.street import furniture_shapes as shapes
+from physics.street import obstacle_shapes
 from physics.street.furniture_shapes import METAL, WOOD, Size, Solid
 from physics.textures.layers import Colour
 from physics.world.mesh import Part
@@ -20,7 +23,9 @@ Zone = Literal["verge", "curb", "frontage", "driveway"]
 """Where a prop stands: between curb and sidewalk; on the sidewalk's edge at the curb, where there is no verge;
 between sidewalk and buildings; in the frontage at the end of a driveway."""
 
-PROP_VARIANTS: Final = 3
+_Forms = tuple[Callable[[Size], tuple[Solid, ...]], Callable[..., tuple[Part, ...]], tuple[Colour, ...]]
+
+PROP_VARIANTS: Final = OBSTACLE_VARIANTS
 """Sizes of each prop, evenly from its smallest to its largest: few, so that many props share a shape."""
 
 LEAVES: Final = ((0.22, 0.42, 0.17), (0.30, 0.48, 0.18), (0.18, 0.36, 0.22), (0.42, 0.46, 0.17))
@@ -30,6 +35,8 @@ BINS: Final = ((0.16, 0.33, 0.22), (0.30, 0.31, 0.33), (0.16, 0.25, 0.42))
 SCOOTERS: Final = ((0.20, 0.72, 0.36), (0.90, 0.42, 0.10), (0.12, 0.12, 0.13))
 CARTONS: Final = ((0.68, 0.52, 0.34), (0.60, 0.45, 0.30), (0.36, 0.42, 0.50))
 CHAIRS: Final = ((0.70, 0.20, 0.16), (0.22, 0.34, 0.50), (0.30, 0.42, 0.26), (0.60, 0.44, 0.28))
+BIKES: Final = ((0.12, 0.24, 0.46), (0.62, 0.11, 0.12), (0.10, 0.10, 0.11), (0.20, 0.46, 0.36))
+BOARDS: Final = ((0.08, 0.09, 0.10), (0.80, 0.12, 0.10), (0.12, 0.30, 0.66), (0.95, 0.80, 0.12))
 FENCES: Final = ((0.88, 0.42, 0.08), (0.80, 0.12, 0.10))
 CARS: Final = ((0.86, 0.86, 0.87), (0.12, 0.13, 0.15), (0.55, 0.57, 0.60), (0.62, 0.11, 0.12), (0.13, 0.24, 0.48))
 ROOFS: Final = ((0.24, 0.26, 0.28), (0.16, 0.30, 0.28))
@@ -135,7 +142,22 @@ CATALOGUE: Final[tuple[PropKind, ...]] = (
 )  # fmt: skip
 """In the order in which they find a place: the large first."""
 
-KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE}
+_OBSTACLES: Final[Mapping[ObstacleKind, _Forms]] = {
+    "bin": (shapes.block, obstacle_shapes.wheeled_bin, ((0.12, 0.30, 0.20), *BINS)),
+    "bike": (shapes.block, obstacle_shapes.bike, BIKES),
+    "sign": (shapes.block, obstacle_shapes.sandwich_board, BOARDS),
+    "planter": (shapes.block, shapes.planter, PLANTS),
+    "box": (shapes.block, shapes.boxes, CARTONS),
+    "fence": (shapes.block, obstacle_shapes.construction_fence, FENCES),
+    "scooter": (shapes.block, shapes.scooter, SCOOTERS),
+    "cafe": (shapes.table_and_chairs, shapes.cafe, CHAIRS),
+}
+"""Solids, parts and paints of what scenarios put on the way."""
+
+KINDS: Final[Mapping[str, PropKind]] = {kind.name: kind for kind in CATALOGUE} | {
+    f"obstacle:{name}": PropKind(f"obstacle:{name}", OBSTACLE_SIZES_M[name], (), {}, *forms, seen_m=math.inf)
+    for name, forms in _OBSTACLES.items()
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,6 +189,14 @@ class Prop:
     def drawn_rad(self) -> float:
         """Heading of what is drawn."""
         return self.heading_rad + self.turned_rad
+
+
+def obstacle_prop(obstacle: Obstacle, number: int) -> Prop:
+    """An obstacle, the scenario's number so many, as the prop that is bumped into and drawn."""
+    kind = KINDS[f"obstacle:{obstacle.kind}"]
+    paint = obstacle.paint % len(kind.paints)
+    at = obstacle.x_m, obstacle.y_m, obstacle.heading_rad
+    return Prop(f"obstacle:{number}:{obstacle.kind}", kind.name, obstacle.variant, *at, paint)
 
 
 def footprints(props: Sequence[Prop], margin_m: float = 0.0) -> NDArray[np.object_]:

@@ -98,7 +98,7 @@ class Bodies:
             of_friction.setdefault(patch.friction, []).append(patch.mesh)
         ground = [self._add_ground(join(meshes), value) for value, meshes in of_friction.items()]
         houses = [body for b in chunk.buildings for body in self._add_building(b)]
-        return [*ground, *houses, *(self._add_prop(prop, z) for prop, z in chunk.props)]
+        return [*ground, *houses, *(self.add_prop(prop, z) for prop, z in chunk.props)]
 
     def _add_ground(self, mesh: Mesh, value: float) -> int:
         middle = mesh.vertices.mean(axis=0) * (1.0, 1.0, 0.0)
@@ -123,7 +123,7 @@ class Bodies:
             self._what[bodies[-1]] = ("wall", building.id)
         return bodies
 
-    def _add_prop(self, prop: Prop, z_m: float) -> int:
+    def add_prop(self, prop: Prop, z_m: float) -> int:
         pool = (prop.kind, prop.variant)
         if pool not in self._shapes:
             solids = solids_of(*pool)

@@ -11,24 +11,31 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from cosim.core.telling import Tell, untold
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
 from physics.street import props
 from physics.street.buildings import FACADES, WINDOW_COLOUR, facade_meshes
-from physics.street.furniture import KINDS, parts_of
+from physics.street.furniture import KINDS, Prop, parts_of
 from physics.textures.ground import ground_layers
 from physics.textures.layers import Colour, encoded, linear
 from physics.world.mesh import Mesh, join
 from physics.world.mesh_surface import Z_UP
-from physics.world.surface import Patch, Surface
+from physics.world.surface import Patch, Surface, stood
 from physics.world.tiles import Key
 
-_GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers")
+_GROUPS: Final = ("surfaces", "buildings", "trees", "furniture", "signals", "barriers", "obstacles")
 """The nodes right below the root; each holds nodes named by what they show, such as "sidewalk:brick:2"."""
 _LAYERS_PX: Final = 256
 
 
-def as_gltf(surface: Surface, keys: Sequence[Key], barriers: Sequence[Barrier] = (), tell: Tell = untold) -> bytes:
-    """A .glb file of the squares of a surface and of the fences on it."""
+def as_gltf(
+    surface: Surface,
+    keys: Sequence[Key],
+    barriers: Sequence[Barrier] = (),
+    tell: Tell = untold,
+    obstacles: Sequence[Obstacle] = (),
+) -> bytes:
+    """A .glb file of the squares of a surface and of the fences and obstacles on it."""
     parts = _Parts()
     for n, key in enumerate(keys):
         tell("building tiles", n / len(keys))
@@ -39,6 +46,8 @@ def as_gltf(surface: Surface, keys: Sequence[Key], barriers: Sequence[Barrier] =
         red, white = props.barrier_meshes(barrier)
         parts.add("barriers", "barrier:red", red.moved(at, barrier.heading_rad), props.PROP_RED)
         parts.add("barriers", "barrier:white", white.moved(at, barrier.heading_rad), props.PROP_WHITE)
+    for prop, z in stood(obstacles, surface):
+        parts.add_prop("obstacles", prop, z)
     tell("writing")
     written: bytes = parts.scene().export(file_type="glb", include_normals=True)
     return written
@@ -64,15 +73,18 @@ class _Parts:
             name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])
             self.add("buildings", f"building:{name}", mesh, colour)
         for prop, z in chunk.props:
-            group = "trees" if prop.kind == "tree" else "furniture"
-            for part in parts_of(*prop.form):
-                mesh = part.mesh.moved((prop.x_m, prop.y_m, z), prop.drawn_rad)
-                self.add(group, f"prop:{prop.kind}", mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
+            self.add_prop("trees" if prop.kind == "tree" else "furniture", prop, z)
         posts = surface.posts(key)
         for post, z in zip(posts, surface.heights([(post.x_m, post.y_m) for post in posts]).tolist(), strict=True):
             self.add(
                 "signals", "signal:post", props.post_mesh().moved((post.x_m, post.y_m, z), post.heading_rad), props.POLE
             )
+
+    def add_prop(self, group: str, prop: Prop, z_m: float) -> None:
+        name = prop.kind if group == "obstacles" else f"prop:{prop.kind}"
+        for part in parts_of(*prop.form):
+            mesh = part.mesh.moved((prop.x_m, prop.y_m, z_m), prop.drawn_rad)
+            self.add(group, name, mesh, part.colour or KINDS[prop.kind].paints[prop.paint])
 
     def _shown(self, patch: Patch) -> Colour:
         """The mean colour of what cameras with textures show."""

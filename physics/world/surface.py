@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -15,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cosim.core.geometry import Floats, Pose
+from cosim.spec.obstacle import Obstacle
 from physics.street.buildings import Building
-from physics.street.furniture import Prop
+from physics.street.furniture import Prop, obstacle_prop
 from physics.street.props import SignalPost
 from physics.textures.facades import WallStyle
 from physics.textures.layers import Colour
@@ -135,3 +137,9 @@ class Surface(ABC):
         pitch = math.atan2(rear_left + rear_right - front_left - front_right, 4.0 * ahead)
         roll = math.atan2(front_left + rear_left - front_right - rear_right, 4.0 * aside)
         return 0.25 * (front_left + front_right + rear_left + rear_right), roll, pitch
+
+
+def stood(obstacles: Sequence[Obstacle], surface: Surface) -> list[tuple[Prop, float]]:
+    """Obstacles as props, each with the height of its foot on a surface in metres."""
+    props = [obstacle_prop(obstacle, number) for number, obstacle in enumerate(obstacles)]
+    return [(prop, surface.foot(prop.x_m, prop.y_m, prop.heading_rad, prop.size_m[:2])) for prop in props]

@@ -16,12 +16,13 @@ import numpy as np
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
 from cosim.core.state import PERSON_RADIUS_M, Command, Contact, Motion, RobotState, Street, write_protected
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier
 from physics.world.bodies import Bodies, Moving
 from physics.world.drive import SkidDrive
 from physics.world.movers import Mover, TickPoses, movers_near
-from physics.world.surface import Surface
+from physics.world.surface import Surface, stood
 from physics.world.tiles import Key, distance_to, distances_within, keys_within
 
 SUBSTEP_S: Final = 0.005
@@ -39,7 +40,7 @@ _ROUNDING_M: Final = 1e-6
 class BulletWorld:
     """The physics of one episode. Use it in a `with` block; one PyBullet client each, so several may live at once.
 
-    surface: what it stands on. barriers: fences that stand for the whole episode.
+    surface: what it stands on. barriers, obstacles: what stands on it for the whole episode besides.
     """
 
     def __init__(
@@ -47,10 +48,12 @@ class BulletWorld:
         surface: Surface,
         barriers: Sequence[Barrier] = (),
         robot: Robot = COURIER,
+        obstacles: Sequence[Obstacle] = (),
     ) -> None:
         self.surface = surface
         self.robot = robot
         self.barriers = tuple(barriers)
+        self.obstacles = tuple(obstacles)
         self._drive = SkidDrive(robot)
         self._bodies: Bodies | None = None
         self._tiles: dict[Key, list[int]] = {}
@@ -69,6 +72,8 @@ class BulletWorld:
                 size = (barrier.thickness_m, barrier.length_m)
                 z = self.surface.foot(barrier.x_m, barrier.y_m, barrier.heading_rad, size)
                 self._bodies.add_barrier(barrier, z)
+            for prop, z in stood(self.obstacles, self.surface):
+                self._bodies.add_prop(prop, z)
         return self
 
     def __exit__(

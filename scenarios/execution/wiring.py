@@ -7,6 +7,7 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 
+import numpy as np
 import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
@@ -18,6 +19,7 @@ from cosim.place import overlay
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
 from cosim.spec.event_kind import EventKinds
+from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, Robot, robot_called
 from cosim.spec.scenario import Barrier, Scenario, event_faults
@@ -76,7 +78,7 @@ def staged(
     with ExitStack() as stack:
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
-        world = stack.enter_context(world_of(street, scenario.barriers, robot))
+        world = stack.enter_context(world_of(street, scenario.barriers, robot, scenario.obstacles))
         crowd = stack.enter_context(crowd_of(scenario))
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
@@ -100,7 +102,7 @@ def staged(
         @cache
         def free() -> Polygon | MultiPolygon:
             """Made for those who are told it: props have to be placed along the whole route."""
-            footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around))
+            footing = clear_of(fenced(walkable, scenario.barriers), street.standing(around), scenario.obstacles)
             room = shapely.buffer(footing, -robot.width_m / 2)
             shapely.prepare(room)
             return room
@@ -117,9 +119,11 @@ def staged(
         )
 
 
-def world_of(surface: Surface, barriers: Sequence[Barrier] = (), robot: Robot = COURIER) -> BulletWorld:
+def world_of(
+    surface: Surface, barriers: Sequence[Barrier] = (), robot: Robot = COURIER, obstacles: Sequence[Obstacle] = ()
+) -> BulletWorld:
     """The physics of a surface, not running yet."""
-    return BulletWorld(surface, barriers, robot)
+    return BulletWorld(surface, barriers, robot, obstacles)
 
 
 def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd:
@@ -144,8 +148,10 @@ def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:
     return street_map.locate(x_m, y_m, FRONTAGE_M).kind != "off"
 
 
-def clear_of(area: Polygon | MultiPolygon, props: Sequence[Prop]) -> Polygon | MultiPolygon:
-    """An area minus the ground that props cover; the area itself where none stands on it."""
-    ground = footprints(props)
+def clear_of(
+    area: Polygon | MultiPolygon, props: Sequence[Prop], obstacles: Sequence[Obstacle] = ()
+) -> Polygon | MultiPolygon:
+    """An area minus the ground that props and obstacles cover; the area itself where none stands on it."""
+    ground = np.array([*footprints(props), *map(footprint, obstacles)], dtype=object)
     ground = ground[shapely.intersects(area, ground)]
     return overlay.difference(area, overlay.union_all(ground)) if len(ground) else area

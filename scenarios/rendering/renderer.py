@@ -208,7 +208,8 @@ class _Renderer:
     def _entered(self, one: _Environment, scenario: Scenario) -> Reply:
         try:
             if self._atlas is not None:
-                world = world_of(_surface(scenario.place), scenario.barriers, robot_called(scenario.robot))
+                robot = robot_called(scenario.robot)
+                world = world_of(_surface(scenario.place), scenario.barriers, robot, scenario.obstacles)
                 one.seat = self._atlas.join(world, scenario.light)
         except Exception as error:  # noqa: BLE001  of one scenario: the others go on
             return _refused(error)

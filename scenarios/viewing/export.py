@@ -20,13 +20,13 @@ _AROUND_M: Final = 30.0
 
 
 def export_street(scenario: Scenario, path: Path, tell: Tell = untold) -> int:
-    """Write the tiles along a scenario's route, and its fences, as .glb; returns how many tiles. y is up, x and -z are
-    the map's x and y, in metres. Raises MachineError when it cannot be written."""
+    """Write the tiles along a scenario's route, its fences and its obstacles, as .glb; returns how many tiles. y is up,
+    x and -z are the map's x and y, in metres. Raises MachineError when it cannot be written."""
     tell(f"reading the street map of {scenario.place.name}")
     _, street_map = place(scenario.place)
     surface = StreetSurface(street_map, scenario.place.seed, scenario.place.roughness)
     keys = keys_in(shapely.buffer(shapely.LineString(scenario.route), _AROUND_M))
-    written = as_gltf(surface, keys, scenario.barriers, tell)
+    written = as_gltf(surface, keys, scenario.barriers, tell, scenario.obstacles)
     try:
         path.write_bytes(written)
     except OSError as error:

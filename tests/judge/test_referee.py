@@ -25,9 +25,10 @@ from cosim.core.state import (
     write_protected,
 )
 from cosim.episode.step import Step
-from cosim.judge.referee import Referee, Verdict
+from cosim.judge.referee import FREE_OF_OBSTACLES_M, Referee, Verdict
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventReply, EventState, Walker
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import City, RouteCrossing, Scenario
 
 CLOCK = Clock()
@@ -228,6 +229,25 @@ def test_entering_a_crossing_at_red_is_noted_once() -> None:
     entries = [v.red_light_entry for v in judge_all(one, [step(t, 29.0 + t * 0.1, red=[":x_c0"]) for t in range(60)])]
     assert [e for e in entries if e] == [":x_c0"]
     assert entries.index(":x_c0") == 11
+
+
+def test_a_reset_keeps_off_obstacles() -> None:
+    """Whatever stands where the robot would be put, or too near to turn there, sends it to the next waypoint; where
+    something stands at every one of them it is put at the nearest."""
+
+    def bin_at(x_m: float, y_m: float = 0.0) -> Obstacle:
+        return Obstacle(kind="bin", x_m=x_m, y_m=y_m, heading_rad=0.0)
+
+    def reset_m(*obstacles: Obstacle) -> float:
+        verdict = referee(obstacles=obstacles).judge(step(0, 21.0, 3.0))
+        assert verdict.reset is not None
+        return verdict.reset.route_s_m
+
+    reach_m = math.hypot(0.35, 0.275) + FREE_OF_OBSTACLES_M + 0.5 * 0.55
+    assert reset_m() == reset_m(bin_at(22.5)) == reset_m(bin_at(20.0, reach_m + 0.01)) == 20.0
+    assert reset_m(bin_at(20.0)) == reset_m(bin_at(20.0, reach_m - 0.01)) == 25.0
+    assert reset_m(bin_at(20.0), bin_at(25.0)) == 15.0
+    assert reset_m(*(bin_at(5.0 * k) for k in range(21))) == 20.0
 
 
 def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:

@@ -46,7 +46,7 @@ class GlCamera(WorldCamera):
         if self._context is None:
             world, light = self._world, self._light
             with context() as gl:
-                scene = GlScene(gl, batch_drawing(gl).forms, world.surface, world.barriers, light)
+                scene = GlScene(gl, batch_drawing(gl).forms, world, light)
                 shadows = ShadowMaps(gl, self._pinhole.height) if light.shadows else None
                 self._stage = Stage(world.surface, world.robot, scene, shadows, Backdrop(gl, self._sky), light)
             self._context = gl

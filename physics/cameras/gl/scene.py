@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, Street
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier
 from physics.cameras.gl.corners import CornerRows
 from physics.cameras.gl.instances import INSTANCE, Forms, Things, instances
@@ -32,8 +33,9 @@ from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.street import props
 from physics.street.furniture import KINDS, Prop, parts_of
 from physics.world.mesh import Part
-from physics.world.surface import Surface
+from physics.world.surface import stood
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
+from physics.world.world import BulletWorld
 
 _CELL_M: Final = 2.0
 _SECTOR_RAD: Final = math.radians(7.5)
@@ -66,10 +68,8 @@ class _Tile:
 class GlScene:
     """Keeps what stands around a view; what is drawn depends on view and signals alone."""
 
-    def __init__(
-        self, context: moderngl.Context, forms: Forms, surface: Surface, barriers: Sequence[Barrier], light: Lighting
-    ) -> None:
-        self._surface, self._forms, self._shadows = surface, forms, light.shadows
+    def __init__(self, context: moderngl.Context, forms: Forms, world: BulletWorld, light: Lighting) -> None:
+        self._surface, self._forms, self._shadows = world.surface, forms, light.shadows
         self._surfaces = surfaces(context)
         ground = tile_shaders(context, self._surfaces, light.shadows)
         walls = wall_shaders(context, self._surfaces, light.shadows, light.lamps > 0.0)
@@ -87,8 +87,10 @@ class GlScene:
         self._still_for: tuple[float, ...] | None = None
         self._lit_for: list[bool | None] = []
         self._lit: _Placed = _NOTHING
-        self._fences = [self._fence(barrier) for barrier in barriers]
-        self._fence_xy = np.array([(b.x_m, b.y_m) for b in barriers]).reshape(-1, 2)
+        self._fences = [self._fence(barrier) for barrier in world.barriers]
+        self._fence_xy = np.array([(b.x_m, b.y_m) for b in world.barriers]).reshape(-1, 2)
+        self._obstacles = self._stood(world.obstacles)
+        self._obstacle_xy = np.array([(o.x_m, o.y_m) for o in world.obstacles]).reshape(-1, 2)
 
     def arrange(self, view: View, middle: Floats, anchor: Floats, street: Street) -> None:
         """Hold everything standing that a picture can show. middle: (3,) of the space with shadows."""
@@ -144,8 +146,9 @@ class GlScene:
             (self._walls, [tile.walls for tile in tiles]),
         ):
             layer.hold(rows, self._middles)
-        self._stands_xy = np.concatenate([tile.thing_xy for tile in tiles])
-        self._stands_seen_m = np.minimum(np.concatenate([tile.seen_m for tile in tiles]), VISIBLE_M)
+        self._stands_xy = np.concatenate([*(tile.thing_xy for tile in tiles), self._obstacle_xy])
+        always = np.full(len(self._obstacle_xy), math.inf)
+        self._stands_seen_m = np.minimum(np.concatenate([*(tile.seen_m for tile in tiles), always]), VISIBLE_M)
         self._posts = [one for tile in tiles for one in zip(tile.posts, tile.post_z.tolist(), strict=True)]
         self._placed = False
 
@@ -156,7 +159,7 @@ class GlScene:
         for layer in (self._ground, self._paint, self._walls):
             layer.place(anchor)
         placed = [self._shifted(self._tiles[key]) for key in self._keys]
-        self._stands = _joined(placed)
+        self._stands = _joined([*placed, _at(self._obstacles, self._obstacle_xy, anchor)])
         self._fenced.set(*_joined([_NOTHING, *self._fences_now(anchor)]))
 
     def _choose(self, cell: tuple[int, int], sector: int, half: int | None) -> None:
@@ -178,7 +181,8 @@ class GlScene:
         still = (*middle.tolist(), *anchor.tolist())
         if still != self._still_for:
             keys = keys_within(float(middle[0]), float(middle[1]), VISIBLE_M - STEP_M)
-            self._standing.set(*_joined([self._shifted(self._tiles[key]) for key in keys]))
+            obstacles = _at(self._obstacles, self._obstacle_xy, anchor)
+            self._standing.set(*_joined([*(self._shifted(self._tiles[key]) for key in keys), obstacles]))
             tiles = np.array([self._keys.index(key) for key in keys], dtype=np.intp)
             for layer in (self._ground, self._walls):
                 layer.show("still", tiles)
@@ -228,13 +232,18 @@ class GlScene:
         rows = instances((barrier.x_m, barrier.y_m, z), barrier.heading_rad, props.PROP_RED, LABELS["barrier"])
         return np.array([form]), rows
 
+    def _stood(self, obstacles: Sequence[Obstacle]) -> _Placed:
+        standing = stood(obstacles, self._surface)
+        if not standing:
+            return _NOTHING
+        form = [self._prop_form(prop) for prop, _ in standing]
+        paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in standing])
+        xyz = np.array([(0.0, 0.0, z) for _, z in standing])
+        rows = instances(xyz, [prop.drawn_rad for prop, _ in standing], paint, LABELS["prop"])
+        return np.array(form, dtype=np.intp), rows
+
     def _fences_now(self, anchor: Floats) -> list[_Placed]:
-        placed = []
-        for (form, rows), xy in zip(self._fences, self._fence_xy, strict=True):
-            here = rows.copy()
-            here["at"][:, :2] = xy - anchor
-            placed.append((form, here))
-        return placed
+        return [_at(fence, xy, anchor) for fence, xy in zip(self._fences, self._fence_xy, strict=True)]
 
     def _light(self, street: Street) -> None:
         """Let the lamp of every signal whose state is known be lit."""
@@ -276,6 +285,14 @@ def _within(offset: Floats, sector: int, half: int, margin_m: float) -> NDArray[
 
 def _lamp(walk: bool) -> list[Part]:
     return [Part(props.lamp_mesh(walk), glows=True)]
+
+
+def _at(placed: _Placed, xy: Floats, anchor: Floats) -> _Placed:
+    """What stands at a point or at (N, 2) points of the world, measured from an anchor."""
+    form, rows = placed
+    here = rows.copy()
+    here["at"][:, :2] = xy - anchor
+    return form, here
 
 
 def _joined(placed: Sequence[_Placed]) -> _Placed:
