@@ -63,7 +63,7 @@ def sandwich_board(size: Size) -> tuple[Part, ...]:
     for side in (-1, 1):
         foot = side * (0.5 * length - 0.03)
         pivot = (foot, 0.0, 0.0)
-        boards.append(box((0.03, depth, tall), (foot, 0.0, 0.5 * tall)).tilted(-side * lean, pivot))
+        boards.append(box((0.03, depth, tall), (foot, 0.0, 0.5 * tall + 0.005)).tilted(-side * lean, pivot))
         plate = box((0.006, depth - 0.10, 0.78 * tall), (foot + side * 0.018, 0.0, 0.55 * tall), skip=("bottom",))
         faces.append(plate.tilted(-side * lean, pivot))
         for k, share in enumerate((0.6, 0.45, 0.5)):
