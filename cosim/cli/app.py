@@ -220,7 +220,7 @@ def run_command(
     out.print(f"Run folder: {path}", soft_wrap=True)
     if lacking := [s.id for s in picked if s.id not in set(table["scenario"])]:
         err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
-    if lacking or (table["status"] == "crashed").any():
+    if lacking or table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
 
 
@@ -292,9 +292,9 @@ def show(
 
     record = records[episode]
     print_episode(out, record)
-    if record.status != "done" and picture is not None:
+    if record.ended is None and picture is not None:
         raise UsageError(f"episode '{episode}' is {record.status}: it has no track to draw. Leave -o out")
-    if record.status == "done":
+    if record.ended is not None:
         path = picture or folder / "episodes" / episode / "above.png"
         with doing(f"drawing {episode}"):
             draw_episode(folder, episode, path)

@@ -14,7 +14,7 @@ from rich.table import Column, Table
 from cosim.core.clock import Clock
 from cosim.judge.metrics import COUNTERFACTUAL, METRICS
 from cosim.records.record import Record
-from cosim.records.results import interval_of, summary_of
+from cosim.records.results import not_to_be_quoted, summary_of
 from cosim.spec.scenario import Scenario, Suite, read_suite
 
 SHOWN = (
@@ -29,22 +29,26 @@ SHOWN = (
 LETTERS = {
     "SR": "success: the goal reached in time without a failure",
     "RC": "share of the route done",
-    "FC": "failures per 100 m",
-    "C": "collisions per 100 m",
-    "OL": "out of lane per 100 m",
-    "F": "freezings per 100 m",
+    "FC": "failures per 100 m travelled",
+    "C": "collisions per 100 m travelled",
+    "OL": "out of lane per 100 m travelled",
+    "F": "freezings per 100 m travelled",
     "V": "mean speed",
 }
 """What a letter means, in every table: what is counted otherwise has no letter."""
 UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
+MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
+"""Those of a run."""
 BY_KIND = (
-    ("collisions", "collided"),
-    ("out_of_lane", "left\nlane"),
-    ("freezings", "froze"),
-    ("rules_broken", "broke\nrule"),
+    ("pedestrian_collision", "hit a\nperson"),
+    ("other_collision", "hit\nelse"),
+    ("left_lane", "left\nlane"),
+    ("broke_rule", "broke\nrule"),
 )
-"""Shares of the episodes of a kind of event: each ends on its first failure."""
+"""Shares of the episodes of a kind of event."""
+NEAREST = ("pedestrian_distance_min_m", "pedestrian_distance_min_success_m")
+"""Means over its episodes, and over those that succeeded."""
 
 
 def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
@@ -61,19 +65,40 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     out.print(shown)
     counted = "/".join(name for _, name in COUNTS)
     out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
-    if len(table):
-        means = Table("mean over episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
-        for (name, head), (_, row) in zip(SHOWN, summary_of(table, [n for n, _ in SHOWN]).iterrows(), strict=True):
-            interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
-            means.add_row(f"{name} ({head})", _cell(row["mean"]), interval, f"{row['n']:.0f}")
-        out.print(means)
+    print_means(out, table)
     print_delays(out, table)
-    crashed = table[table["status"] == "crashed"]
-    invalid = table[table["status"] == "invalid"]
-    counted_apart = f", invalid {len(invalid)}" if len(invalid) else ""
-    out.print(f"scheduled {scheduled}, finished {len(table)}, crashed {len(crashed)}{counted_apart}")
-    for _, row in pd.concat([crashed, invalid]).iterrows():
+    print_statuses(out, table, scheduled)
+
+
+def print_means(out: Console, table: pd.DataFrame) -> None:
+    """What came out of all episodes of a run together."""
+    if not len(table):
+        return
+    means = Table("over all episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
+    for (name, head), (_, row) in zip(MEANS, summary_of(table, [n for n, _ in MEANS]).iterrows(), strict=True):
+        means.add_row(f"{name} ({head})" if head else name, *_mean_cells(row))
+    out.print(means)
+    crashed = int((table["status"] == "crashed").sum())
+    missing = f"; none, because {crashed} crashed" if crashed else ""
+    out.print(f"rates are pooled: all failures on all metres{missing}; what crashed counts as the worst elsewhere")
+
+
+def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
+    """Mean, interval and number of episodes, from a row of `summary_of`."""
+    interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
+    return _cell(row["mean"]), interval, f"{row['n']:.0f}"
+
+
+def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
+    """How many episodes there are of each status, why, and whether the run may be quoted."""
+    parts = {status: table[table["status"] == status] for status in ("done", "crashed", "invalid")}
+    scored = len(parts["done"]) + len(parts["crashed"])
+    counts = f"scheduled {scheduled}, scored {scored}, of these crashed {len(parts['crashed'])}"
+    out.print(f"{counts}; invalid {len(parts['invalid'])}")
+    for _, row in pd.concat([parts["crashed"], parts["invalid"]]).iterrows():
         out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
+    if reason := not_to_be_quoted(table, scheduled):
+        out.print(f"not to be quoted: {reason}", soft_wrap=True, highlight=False)
 
 
 def print_scenarios(out: Console, suite: Suite) -> None:
@@ -93,8 +118,7 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
         return
     shown = Table("against the same street without the robot", "per episode", "95 % interval", "n", box=box.SIMPLE_HEAD)
     for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
-        interval = f"{_cell(row['low'])} to {_cell(row['high'])}" if row["n"] else "-"
-        shown.add_row(str(name), _cell(row["mean"]), interval, f"{row['n']:.0f}")
+        shown.add_row(str(name), *_mean_cells(row))
     out.print(shown)
 
 
@@ -138,23 +162,24 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
     if len(set(kinds.values())) < 2:
         return
-    heads = ("n", "SR", "95 % of SR", *(head for _, head in BY_KIND), "invalid", "nearest\nm")
+    heads = ("n", "SR", "95 % of SR", *(head for _, head in BY_KIND), "in-\nvalid", "nearest\nm", "of suc-\ncesses")
     numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
     shown = Table(Column("event", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
+    names = ("success", *(name for name, _ in BY_KIND), *NEAREST)
     for kind in dict.fromkeys(kinds.values()):
         part = table[table["scenario"].map(kinds) == kind]
-        success, *shares = (
-            pd.to_numeric(part[name], errors="coerce").dropna() for name in ("success", *(name for name, _ in BY_KIND))
-        )
-        low, high = interval_of(success.to_numpy(dtype=float))
-        nearest = pd.to_numeric(part["pedestrian_distance_min_m"], errors="coerce").min()
-        interval = f"{low:.2f}..{high:.2f}" if len(success) else "-"
+        means = summary_of(part, names)
+        low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
+        interval = f"{low:.2f}..{high:.2f}" if scored else "-"
+        success, *shares, nearest, of_successes = (_cell(mean) for mean in means["mean"])
         invalid = str((part["status"] == "invalid").sum())
-        cells = (_cell(values.mean()) for values in shares)
-        shown.add_row(kind, str(len(part)), _cell(success.mean()), interval, *cells, invalid, _cell(nearest))
+        shown.add_row(kind, f"{scored:.0f}", success, interval, *shares, invalid, nearest, of_successes)
     out.print(shown)
     named = ", ".join(head.replace("\n", " ") for _, head in BY_KIND)
-    out.print(f"n episodes; {named}: share of the event's episodes; nearest: least distance to a person's centre")
+    out.print(
+        f"n episodes that are scored; {named}: share of the event's episodes; nearest: least distance to a person's "
+        "centre, mean over episodes, and over those that succeeded"
+    )
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:

@@ -19,7 +19,9 @@ class Log:
     """An episode tick by tick, T rows; values at the end of each tick.
 
     pose (T, 3) x m, y m, heading rad; speed (T, 2) v m/s, w rad/s; command (T, 2) likewise; route_s_m (T,);
-    travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one;
+    travelled_m (T,) of this tick; person_m (T,) centre distance to the nearest person, inf without one; clearance_m
+    (T,) least gap between the robot's outline and a person's disk, not below 0, inf without one; collision_in_s (T,)
+    least time until robot and a person would meet if both kept their velocities, inf if they would not;
     reset_s_m (T,) arc length the robot was reset to after the tick, NaN without reset; waits_at_red (T,) bool.
     on_carriageway (T,) bool, vehicles_braked (T,) number of them: see `cosim.judge.traffic`.
     people_tick (P,), people_xy (P, 2), people_kind, people_age (P,) of `PersonKind` and `Age`: persons within 30 m,
@@ -40,6 +42,8 @@ class Log:
     route_s_m: Floats
     travelled_m: Floats
     person_m: Floats
+    clearance_m: Floats
+    collision_in_s: Floats
     reset_s_m: Floats
     waits_at_red: NDArray[np.bool_]
     on_carriageway: NDArray[np.bool_]
@@ -54,9 +58,16 @@ class Log:
         return len(self.pose)
 
     def row(self, tick: int) -> Floats:
-        """(14,) the values of a tick, in the order of `cosim.records.record.log_row`."""
+        """(16,) the values of a tick, in the order of `cosim.records.record.log_row`."""
         columns = (self.pose, self.speed, self.command, self.route_s_m, self.travelled_m, self.person_m)
-        more = (self.reset_s_m, self.waits_at_red, self.on_carriageway, self.vehicles_braked)
+        more = (
+            self.clearance_m,
+            self.collision_in_s,
+            self.reset_s_m,
+            self.waits_at_red,
+            self.on_carriageway,
+            self.vehicles_braked,
+        )
         return np.hstack([column[tick] for column in (*columns, *more)]).astype(float)
 
     def encoded(self) -> bytes:

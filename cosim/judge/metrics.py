@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.core.geometry import Floats
 from cosim.episode.log import Log
 from cosim.judge.referee import Failure
 from cosim.records.record import Ended
 
-SCHEMA = 2
+SCHEMA = 3
 """Raised whenever a definition changes; results of different schemas are not compared."""
 
 STALLED_MPS = 0.05
@@ -31,7 +32,8 @@ RATE_NEEDS_M = 1.0
 @dataclass(frozen=True)
 class EpisodeFacts:
     """What the metrics see of an episode. route_length_m: of the reference route, the geodesic walkable length.
-    rules_broken: of events that were not passed as they should be. walked_into: contacts at a person's fault."""
+    rules_broken: of events that were not passed as they should be. walked_into: contacts at a person's fault.
+    period_ticks: of the policy, from one command to the next."""
 
     log: Log
     failures: tuple[Failure, ...]
@@ -40,6 +42,7 @@ class EpisodeFacts:
     route_length_m: float
     rules_broken: int = 0
     walked_into: tuple[Failure, ...] = ()
+    period_ticks: int = 5
 
 
 class Metric(NamedTuple):
@@ -63,6 +66,11 @@ def success(episode: EpisodeFacts) -> float:
 def travelled_m(episode: EpisodeFacts) -> float:
     """Driven length: sum of displacements at the physics rate, reset jumps excluded."""
     return float(episode.log.travelled_m.sum())
+
+
+def route_length_m(episode: EpisodeFacts) -> float:
+    """Length of the reference route, driven or not."""
+    return episode.route_length_m
 
 
 def progress_m(episode: EpisodeFacts) -> float:
@@ -108,6 +116,24 @@ def pedestrian_distance_min_m(episode: EpisodeFacts) -> float | None:
     return nearest if np.isfinite(nearest) else None
 
 
+def pedestrian_distance_min_success_m(episode: EpisodeFacts) -> float | None:
+    """Least centre distance to a person in an episode that succeeded, as the paper averages it; absent in others."""
+    return pedestrian_distance_min_m(episode) if success(episode) else None
+
+
+def clearance_min_m(episode: EpisodeFacts) -> float | None:
+    """Least gap between the robot's outline and a person's 0.3 m disk, 0 where they met; absent without people."""
+    least = float(episode.log.clearance_m.min()) if len(episode.log) else np.inf
+    return least if np.isfinite(least) else None
+
+
+def time_to_collision_min_s(episode: EpisodeFacts) -> float | None:
+    """Least time until robot and a person would have met had both kept their velocities (Francis et al., after Biswas
+    et al. 2022), both taken as disks (`cosim.records.record.time_to_collision_s`); absent if they never would have."""
+    least = float(episode.log.collision_in_s.min()) if len(episode.log) else np.inf
+    return least if np.isfinite(least) else None
+
+
 def space_compliance(episode: EpisodeFacts) -> float | None:
     """Share of ticks with nobody within 0.45 m (centre distance); absent without people."""
     if pedestrian_distance_min_m(episode) is None:
@@ -137,6 +163,32 @@ def failure_to_progress(episode: EpisodeFacts) -> float:
     return float(sum(driven[i : i + window].sum() < PROGRESS_MIN_M for i in windows))
 
 
+def accelerations_mps2(episode: EpisodeFacts) -> list[Floats]:
+    """Accelerations along the robot's heading, from one command to the next; an array for each stretch without a reset,
+    across which nothing is differenced."""
+    log, period = episode.log, episode.period_ticks
+    ends = [*(np.flatnonzero(np.isfinite(log.reset_s_m)) + 1).tolist(), len(log)]
+    stretches = zip([0, *ends[:-1]], ends, strict=True)
+    speeds = (np.concatenate([[0.0], log.speed[begin:end, 0]])[::period] for begin, end in stretches)
+    return [np.diff(v_mps) / (period * log.tick_s) for v_mps in speeds]
+
+
+def mean_acceleration_mps2(episode: EpisodeFacts) -> float | None:
+    """Mean magnitude of the acceleration, at the policy's rate (Francis et al.)."""
+    return _mean_magnitude(accelerations_mps2(episode))
+
+
+def mean_jerk_mps3(episode: EpisodeFacts) -> float | None:
+    """Mean magnitude of the change of acceleration in a second, at the policy's rate (Francis et al.)."""
+    period_s = episode.period_ticks * episode.log.tick_s
+    return _mean_magnitude([np.diff(one) / period_s for one in accelerations_mps2(episode)])
+
+
+def _mean_magnitude(stretches: list[Floats]) -> float | None:
+    values = np.abs(np.concatenate(stretches))
+    return float(values.mean()) if len(values) else None
+
+
 def carriageway_time_s(episode: EpisodeFacts) -> float:
     """Time with the base centre on a road outside the crossings, or on a crossing whose signal says stop."""
     return float(episode.log.on_carriageway.sum() * episode.log.tick_s)
@@ -155,6 +207,16 @@ def count(kind: str) -> Callable[[EpisodeFacts], float]:
 def collisions_with(other_kind: str) -> Callable[[EpisodeFacts], float]:
     """Number of collisions with a kind of thing."""
     return lambda episode: float(sum(f.kind == "collision" and f.other_kind == other_kind for f in episode.failures))
+
+
+def had(count_of: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float]:
+    """1 if there was one or more of what is counted: its mean over episodes is a rate of episodes."""
+    return lambda episode: float(count_of(episode) > 0.0)
+
+
+def collisions_with_the_rest(episode: EpisodeFacts) -> float:
+    """Number of collisions with anything but a person."""
+    return count("collision")(episode) - collisions_with("pedestrian")(episode)
 
 
 def per_100m(kind: str, distance: Callable[[EpisodeFacts], float]) -> Callable[[EpisodeFacts], float | None]:
@@ -178,6 +240,7 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "out_of_lane_per_100m": Metric("1/100 m", False, per_100m("out_of_lane", travelled_m)),
         "freezings_per_100m": Metric("1/100 m", False, per_100m("freezing", travelled_m)),
         "failures_per_100m_progress": Metric("1/100 m", False, per_100m("", progress_m)),
+        "failures_per_100m_route": Metric("1/100 m", False, per_100m("", route_length_m)),
         "velocity_mean_mps": Metric("m/s", True, velocity_mean_mps),
         "failures": Metric("", False, count("")),
         "rules_broken": Metric("", False, lambda episode: float(episode.rules_broken)),
@@ -189,20 +252,43 @@ METRICS: Mapping[str, Metric] = MappingProxyType(
         "collisions_wall": Metric("", False, collisions_with("wall")),
         "collisions_object": Metric("", False, collisions_with("object")),
         "walked_into": Metric("", None, lambda episode: float(len(episode.walked_into))),
+        "pedestrian_collision": Metric("", False, had(collisions_with("pedestrian"))),
+        "other_collision": Metric("", False, had(collisions_with_the_rest)),
+        "left_lane": Metric("", False, had(count("out_of_lane"))),
+        "broke_rule": Metric("", False, had(lambda episode: float(episode.rules_broken))),
         "red_light_entries": Metric("", False, lambda episode: float(episode.red_light_entries)),
         "carriageway_time_s": Metric("s", False, carriageway_time_s),
         "vehicles_braked": Metric("", False, vehicles_braked),
         "pedestrian_distance_min_m": Metric("m", True, pedestrian_distance_min_m),
+        "pedestrian_distance_min_success_m": Metric("m", True, pedestrian_distance_min_success_m),
+        "clearance_min_m": Metric("m", True, clearance_min_m),
+        "time_to_collision_min_s": Metric("s", True, time_to_collision_min_s),
         "space_compliance": Metric("", True, space_compliance),
         "personal_space_violation": Metric("", False, personal_space_violation),
         "stalled_time_s": Metric("s", False, stalled_time_s),
         "failure_to_progress": Metric("", False, failure_to_progress),
+        "acceleration_mean_mps2": Metric("m/s2", False, mean_acceleration_mps2),
+        "jerk_mean_mps3": Metric("m/s3", False, mean_jerk_mps3),
         "path_length_m": Metric("m", None, travelled_m),
+        "route_length_m": Metric("m", None, route_length_m),
         "progress_m": Metric("m", True, progress_m),
         "time_s": Metric("s", None, time_s),
         "time_to_goal_s": Metric("s", False, lambda e: time_s(e) if goal_reached(e) else None),
     }
 )
+
+POOLED: Mapping[str, tuple[str, str]] = MappingProxyType(
+    {
+        "failures_per_100m": ("failures", "path_length_m"),
+        "collisions_per_100m": ("collisions", "path_length_m"),
+        "out_of_lane_per_100m": ("out_of_lane", "path_length_m"),
+        "freezings_per_100m": ("freezings", "path_length_m"),
+        "failures_per_100m_progress": ("failures", "progress_m"),
+        "failures_per_100m_route": ("failures", "route_length_m"),
+    }
+)
+"""Rates: the metric that is counted, the metres it is counted on. Of several episodes a rate is all that was counted on
+all the metres: a mean of rates would let an episode of 2 m outweigh one of 400 m, and leave out who never moved."""
 
 COUNTERFACTUAL: Mapping[str, str] = MappingProxyType(
     {"people_delay_s": "s", "people_compared": "", "vehicles_delay_s": "s", "vehicles_compared": ""}

@@ -20,6 +20,7 @@ from cosim.core.whole_file import write_whole
 from cosim.episode.log import Log
 from cosim.episode.ports import Manifest, WaypointRule
 from cosim.episode.step import Step
+from cosim.judge.nearness import nearness
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
@@ -55,7 +56,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     walked_into: contacts with people who walked into the robot where it stood; no failures.
     waypoints: how those that it answers were followed.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
-    invalid: its event never happened or was never in view, so it says nothing about the policy: counted apart.
+    crashed: its policy crashed, which counts as a failure. invalid: what the simulator owes, counted apart: it came to
+    its end without a failure, and its event had not happened or could not be seen; or an engine failed, twice. ended:
+    absent if it did not come to its end: then there is no trajectory.
 
     `Record.load` reads the record.json of a run folder and raises RunError naming the file and the field.
 
@@ -163,23 +166,22 @@ class StateHash:
         return self._hash.hexdigest()
 
 
-def log_row(step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> tuple[float, ...]:  # noqa: B008  a frozen value
-    """The 14 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
+def log_row(
+    step: Step,
+    verdict: Verdict,
+    footprint_m: tuple[float, float],
+    road: OnRoad = OnRoad(),  # noqa: B008  a frozen value
+) -> tuple[float, ...]:
+    """The 16 values of a tick that a `Log` keeps: its columns from `pose` to `vehicles_braked`."""
     robot = step.motion.robot
     track = np.concatenate([[step.robot.pose[:2]], step.motion.trace[:, :2]])
     way = track[1:] - track[:-1]
     travelled_m = float(np.hypot(way[:, 0], way[:, 1]).sum())
-    person_m = float(_away_m(step).min(initial=np.inf))
     reset_s_m = verdict.reset.route_s_m if verdict.reset else np.nan
     speeds = (robot.v_mps, robot.w_radps, step.command.v_mps, step.command.w_radps)
-    measured = (step.route_s_after_m, travelled_m, person_m, reset_s_m, float(verdict.waits_at_red))
+    near = nearness(robot, step.street_after.people, footprint_m)
+    measured = (step.route_s_after_m, travelled_m, *near, reset_s_m, float(verdict.waits_at_red))
     return (*robot.pose, *speeds, *measured, float(road.carriageway), float(road.braked))
-
-
-def _away_m(step: Step) -> Floats:
-    """(N,) distances of the people's centres from the robot's."""
-    xy: Floats = step.street_after.people.xy - step.motion.robot.pose.xy
-    return np.hypot(xy[:, 0], xy[:, 1])
 
 
 class Recorder:
@@ -188,23 +190,25 @@ class Recorder:
     PEOPLE_EVERY_TICKS = 20
     PEOPLE_WITHIN_M = 30.0
 
-    def __init__(self, tick_s: float) -> None:
-        self._tick_s = tick_s
+    def __init__(self, tick_s: float, footprint_m: tuple[float, float]) -> None:
+        self._tick_s, self._footprint_m = tick_s, footprint_m
         self._rows: list[tuple[float, ...]] = []
         self._people: list[tuple[float, ...]] = []
         self.hash = StateHash()
 
     def add(self, step: Step, verdict: Verdict, road: OnRoad = OnRoad()) -> None:  # noqa: B008  a frozen value
         self.hash.add(step)
-        self._rows.append(log_row(step, verdict, road))
+        self._rows.append(log_row(step, verdict, self._footprint_m, road))
         if step.tick % self.PEOPLE_EVERY_TICKS == 0:
-            people = step.street_after.people.only(np.flatnonzero(_away_m(step) < self.PEOPLE_WITHIN_M))
+            people = step.street_after.people
+            xy = people.xy - step.motion.robot.pose.xy
+            people = people.only(np.flatnonzero(np.hypot(xy[:, 0], xy[:, 1]) < self.PEOPLE_WITHIN_M))
             for xy, kind, age in zip(people.xy.tolist(), people.kind.tolist(), people.age.tolist(), strict=True):
                 self._people.append((step.tick, *xy, kind, age))
 
     def log(self, event_tracks: Floats) -> Log:
         """The episode so far. event_tracks: see `Log`."""
-        rows = np.array(self._rows, dtype=float).reshape(-1, 14)
+        rows = np.array(self._rows, dtype=float).reshape(-1, 16)
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         return Log(
             tick_s=self._tick_s,
@@ -214,10 +218,12 @@ class Recorder:
             route_s_m=rows[:, 7],
             travelled_m=rows[:, 8],
             person_m=rows[:, 9],
-            reset_s_m=rows[:, 10],
-            waits_at_red=rows[:, 11] > 0,
-            on_carriageway=rows[:, 12] > 0,
-            vehicles_braked=rows[:, 13].astype(np.int64),
+            clearance_m=rows[:, 10],
+            collision_in_s=rows[:, 11],
+            reset_s_m=rows[:, 12],
+            waits_at_red=rows[:, 13] > 0,
+            on_carriageway=rows[:, 14] > 0,
+            vehicles_braked=rows[:, 15].astype(np.int64),
             people_tick=people[:, 0].astype(np.int64),
             people_xy=people[:, 1:3],
             people_kind=people[:, 3].astype(np.int8),

@@ -6,8 +6,11 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cosim.core.errors import EngineError
-from cosim.core.geometry import Pose
+from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PERSON_RADIUS_M, RobotState
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Barrier
@@ -294,6 +297,11 @@ class Bodies:
             for body in self.watched
             if any(c[8] <= 0.0 for c in p.getContactPoints(self._robot, body, physicsClientId=self._client))
         ]
+
+    def blocked(self, begin_m: Floats, end_m: Floats) -> NDArray[np.bool_]:
+        """On which of (N, 3) -> (N, 3) lines something stands."""
+        hits = self._do("rayTestBatch", begin_m.tolist(), end_m.tolist())
+        return np.array([hit[0] >= 0 for hit in hits], dtype=bool)
 
     def _do(self, call: str, *args: Any, **options: Any) -> Any:
         try:

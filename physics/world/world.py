@@ -12,6 +12,7 @@ from types import TracebackType
 from typing import Final, Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.errors import EngineError
 from cosim.core.geometry import Floats, Pose, box_disk_gap, boxes_overlap
@@ -35,6 +36,8 @@ _STRAY_M: Final = 0.2
 _CLEAR_M: Final = 0.5
 """Who can be touched is who a robot would touch that were larger by this: more than it strays before that is seen."""
 _ROUNDING_M: Final = 1e-6
+_OWN_M: Final = 0.45
+"""From a point of a body, at most so far lies its surface."""
 
 
 class BulletWorld:
@@ -97,6 +100,19 @@ class BulletWorld:
         z, roll, pitch = self.surface.lean(pose, self.robot.drive.span_m)
         bodies.place_robot((pose.x_m, pose.y_m, z + 0.001), (roll, pitch, pose.heading_rad))
         return bodies.robot_state()
+
+    def hidden(self, eye_m: Floats, points_m: Floats) -> NDArray[np.bool_]:
+        """Which of (N, 3) points something solid hides from an eye (3,) on the robot. What stands closer than
+        _OWN_M to a point is what is looked at, and what is so near the eye is the robot. What stands farther than
+        _LOAD_M from the robot may not be in the engine."""
+        rays = points_m - eye_m
+        far_m = np.sqrt((rays**2).sum(axis=1))
+        hidden = np.zeros(len(points_m), dtype=bool)
+        long = far_m > 2 * _OWN_M
+        if long.any():
+            inset = _OWN_M * rays[long] / far_m[long, None]
+            hidden[long] = self._engine.blocked(eye_m + inset, points_m[long] - inset)
+        return hidden
 
     def step(self, command: Command, before: Street, after: Street, substeps: int) -> Motion:
         """One tick of physics; people and vehicles move evenly from `before` to `after`."""

@@ -160,7 +160,7 @@ def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:
     lines = []
     for scenario in todo:
         path = held.episode_folder(scenario.id) / "record.json"
-        if path.exists() and (record := Record.load(path)).status != "crashed":
+        if path.exists() and (record := Record.load(path)).ended is not None:
             one = measured(record, scenario, held.spec.policy, held.spec.counterfactual, jobs)
             lines.append(msgspec.json.encode(one))
     if not lines:

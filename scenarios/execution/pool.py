@@ -1,9 +1,11 @@
 """Runs scenarios by N workers, which a transport reaches.
 
 A worker that dies (SUMO and PyBullet can take its process down) is replaced and its scenario tried once more; an engine
-that shows no sign of life is killed. After the last attempt the episode is recorded as crashed, so that none is ever
-lost. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in time is
-not asked again: its episode has crashed. What comes out of an episode is written here, by the run's own process.
+that shows no sign of life is killed. After the last attempt the episode is recorded, so that none is ever lost: as
+invalid if it was an engine that failed, as crashed if that may have been the policy, which gets nothing out of ending
+its process. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in
+time is not asked again: its episode has crashed. What comes out of an episode is written here, by the run's own
+process.
 """
 
 from __future__ import annotations
@@ -12,6 +14,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import msgspec
 
@@ -58,14 +61,24 @@ def run_all(
         while waiting or pool.busy:
             while waiting and len(pool.busy) < jobs:
                 pool.give(waiting.popleft())
-            for scenario, why in pool.listen():
-                attempts[scenario.id] += bool(why)
-                if attempts[scenario.id] < ATTEMPTS:
-                    waiting.appendleft(scenario)
+            for lost in pool.listen():
+                attempts[lost.scenario.id] += bool(lost.why)
+                if attempts[lost.scenario.id] < ATTEMPTS:
+                    waiting.appendleft(lost.scenario)
                 else:
-                    pool.give_up(scenario, f"{why}, {ATTEMPTS} times; see logs/ in the run folder")
+                    why = f"{lost.why}, {ATTEMPTS} times; see logs/ in the run folder"
+                    pool.give_up(lost.scenario, why, "invalid" if lost.in_engine else "crashed")
     finally:
         pool.close()
+
+
+class _Lost(NamedTuple):
+    """A scenario that is not done, whose worker or whose engine failed. why: "" if it never began; in_engine: whether
+    it was an engine for sure."""
+
+    scenario: Scenario
+    why: str
+    in_engine: bool = False
 
 
 class _Slot:
@@ -96,6 +109,7 @@ class _Pool:
         self._options, self._tell, self._patience = options, tell, patience
         self._renderer = renderer
         self._bereft: list[tuple[Scenario, LostRenderer]] = []
+        self._again: list[_Lost] = []
         self._workers: list[_Slot] = []
         self._failed_starts = 0
 
@@ -110,16 +124,17 @@ class _Pool:
         self._folder.forget(scenario.id)
         idle.worker.give(Job(scenario, self._options))
 
-    def listen(self) -> list[tuple[Scenario, str]]:
-        """Take in what the workers say. Returns the scenarios whose worker was lost, and why; "" if it never began."""
-        lost = []
+    def listen(self) -> list[_Lost]:
+        """Take in what the workers say. Returns the scenarios that are to be run again."""
+        lost: list[_Lost] = []
         self._transport.wait(POLL_S)
         if self._renderer is not None:
             self._renderer.tend()
         for one in list(self._workers):
             if not one.worker.listen(partial(self._take, one)):
                 why = one.worker.end()
-                lost += self._lost(one, why, began=not (one.ran and one.silent) or one.worker.question is not None)
+                began = not (one.ran and one.silent) or one.worker.question is not None
+                lost += self._lost(one, why, began=began, in_engine=one.worker.in_engine)
             elif one.job is None:
                 continue
             elif (question := one.worker.question) is not None:
@@ -128,22 +143,24 @@ class _Pool:
                     self._leave_unanswered(one, one.job, question)
             elif time.monotonic() - one.heard_at > SILENCE_S:
                 one.worker.kill()
-                lost += self._lost(one, "the environment process showed no sign of life")
+                lost += self._lost(one, "the environment process showed no sign of life", in_engine=True)
         while self._bereft:
             lost += self._without_renderer(*self._bereft.pop())
+        lost += self._again
+        self._again.clear()
         return lost
 
-    def _without_renderer(self, scenario: Scenario, lost: LostRenderer) -> list[tuple[Scenario, str]]:
+    def _without_renderer(self, scenario: Scenario, lost: LostRenderer) -> list[_Lost]:
         """The shared renderer has ended in the middle of an episode, which is to be run again. It was an attempt if its
         policy was being asked; if that gave no answer in time it was the last one."""
         assert self._renderer is not None
         end = self._renderer.end_of(lost.number)
         if end is None:
-            return [(scenario, "the environment process lost its connection to the shared renderer")]
+            return [_Lost(scenario, "the environment process lost its connection to the shared renderer")]
         if lost.asked and end.unanswered_s is not None:
             self.give_up(scenario, f"{self._silent(end.unanswered_s)} in {lost.asked} of {scenario.id}")
             return []
-        return [(scenario, end.words if lost.asked else "")]
+        return [_Lost(scenario, end.words if lost.asked else "")]
 
     def _silent(self, allowed_s: float) -> str:
         return f"policy '{self._hello.manifest.name}' gave no answer for {allowed_s:g} s"
@@ -174,19 +191,21 @@ class _Pool:
             record = None
         if record is None or record.scenario != scenario.id:
             self.give_up(scenario, "its record was damaged when it arrived")
+        elif done.again:
+            self._again.append(_Lost(scenario, record.reason, in_engine=True))
         else:
             self._folder.keep(record, done.log)
             self._over(scenario, record.status)
 
-    def _lost(self, one: _Slot, why: str, *, began: bool = True) -> list[tuple[Scenario, str]]:
+    def _lost(self, one: _Slot, why: str, *, began: bool = True, in_engine: bool = False) -> list[_Lost]:
         """A worker has ended. Returns its scenario if that is not done, and why, if it was begun."""
         self._workers.remove(one)
         if one.job is None:
             return []
         if one.ready:
-            return [(one.job, why if began else "")]
+            return [_Lost(one.job, why if began else "", in_engine)]
         self._not_started(one, why)
-        return [(one.job, "")]
+        return [_Lost(one.job, "")]
 
     def _leave_unanswered(self, one: _Slot, scenario: Scenario, question: Question) -> None:
         """The policy takes too long: its process is killed, and its episode has crashed, once."""
@@ -207,11 +226,11 @@ class _Pool:
             raise UsageError(f"policy '{self._hello.policy}' cannot be loaded: {told}")
         raise MachineError(f"{told}, and `cosim doctor`")
 
-    def give_up(self, scenario: Scenario, reason: str) -> None:
-        """Record a scenario as crashed: no worker survives it, or the policy does not answer."""
+    def give_up(self, scenario: Scenario, reason: str, status: Status = "crashed") -> None:
+        """Record a scenario that does not come to its end: no worker survives it, or the policy does not answer."""
         record = begun(scenario, self._hello.manifest, self._folder.spec.suite_hash, self._hello.source_hash)
-        self._folder.keep(msgspec.structs.replace(record, reason=reason))
-        self._over(scenario, "crashed")
+        self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
+        self._over(scenario, status)
 
     def _over(self, scenario: Scenario, status: Status) -> None:
         if self._renderer is not None:

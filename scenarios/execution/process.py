@@ -11,6 +11,7 @@ import sys
 from contextlib import suppress
 from multiprocessing.connection import wait
 from pathlib import Path
+from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
 from typing import Final
 
 import msgspec
@@ -23,6 +24,8 @@ from scenarios.execution.wire import Wire
 _WORKER: Final = "scenarios.execution.worker:serve_jobs"
 ENDING_S: Final = 10.0
 """What a process is left to end by itself, and then its shepherd to clear up."""
+_FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
+"""Exit codes of a process that compiled code has ended."""
 _CODE: Final = (
     "import sys; sys.path[:] = {path!r}; from scenarios.execution.shepherd import keep_worker; "
     "keep_worker({serves!r}, {given}, {run})"
@@ -58,6 +61,7 @@ class KeptProcess:
         self.log, self.open, self._called = str(log), True, called
         self._asked = Asked.new()
         self._last_asked: Question | None = None
+        self.in_engine = False
         ours, theirs = socket.socketpair()
         self.wire = Wire(ours)
         given = (theirs.fileno(), self._asked.descriptor, *also)
@@ -120,6 +124,7 @@ class KeptProcess:
             self._last_asked, self.open = self._asked.question, False
             self._asked.close()
         during = f" in the policy's {self._last_asked.when}" if self._last_asked is not None else ""
+        self.in_engine = self._last_asked is None and code in _FAULTS
         return f"the {self._called} process {_in_words(code)}{during}"
 
     def _code(self, wait_s: float) -> int | None:

@@ -19,13 +19,14 @@ from cosim.policies.replay import Replay
 from cosim.records.record import Record, log_row
 from cosim.records.run_folder import read_records
 from cosim.spec.options import CameraChoice, EpisodeOptions
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, read_suite
 from scenarios.execution.counterfactual import Beside, Compared
 from scenarios.execution.episode import Episode, Watch
 from scenarios.execution.run import drive
 from sumo_nets.crowd.demand_log import Entrances
 
-OF_THE_ROAD: Final = 12
+OF_THE_ROAD: Final = 14
 """From this value of a row on it is about the roads, which are judged beside the loop."""
 
 
@@ -45,8 +46,8 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
     scenarios = {s.id: s for s in read_suite(folder / "scenarios.json").scenarios}
     episode = folder / "episodes" / scenario_id
     record = Record.load(episode / "record.json")
-    if record.status == "crashed":
-        raise RunError(f"{folder}: '{scenario_id}' crashed: there is nothing to run again")
+    if record.ended is None:
+        raise RunError(f"{folder}: '{scenario_id}' did not come to its end: there is nothing to run again")
     return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
 
 
@@ -86,10 +87,11 @@ class Alike:
 
     def __init__(self, folder: Path, told: Recorded) -> None:
         self._folder, self._told = folder, told
+        self._footprint_m = robot_called(told.scenario.robot).footprint_m
 
     def watch(self, step: Step, verdict: Verdict) -> None:
         """The next tick. Raises RunError when it is not the recorded one."""
-        now, then = np.array(log_row(step, verdict)), self._told.log.row(step.tick)
+        now, then = np.array(log_row(step, verdict, self._footprint_m)), self._told.log.row(step.tick)
         if not np.array_equal(now[:OF_THE_ROAD], then[:OF_THE_ROAD], equal_nan=True):
             raise otherwise(self._folder, self._told, f"from {Clock().time_s(step.tick):g} s on")
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import msgspec
 
-from cosim.core.errors import CosimError, RendererLost
+from cosim.core.errors import CosimError, DirectorLost, EngineError, PolicyError, RendererLost
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.log import Log
 from cosim.episode.ports import Policy
-from cosim.records.record import Record
+from cosim.records.record import Record, Status
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario
 from scenarios.execution.counterfactual import Beside, TellShare, untold_share
@@ -21,11 +21,13 @@ from scenarios.execution.episode import Episode, Watch, unheard
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came out of an episode. log: None if it crashed; traceback: of a crash, or of a comparison that failed."""
+    """What came out of an episode. log: None if it crashed; traceback: of a crash, or of a comparison that failed;
+    again: an engine failed, which may not happen another time."""
 
     record: Record
     log: Log | None
     traceback: str = ""
+    again: bool = False
 
 
 def run_episode(
@@ -37,8 +39,9 @@ def run_episode(
     waiting: Callable[[str], None] = unheard,
     comparing: TellShare = untold_share,
 ) -> Outcome:
-    """Run one scenario to its end. Whatever goes wrong inside becomes a record with status `crashed`; but for a shared
-    renderer that has ended: then it raises RendererLost, and is to be run again.
+    """Run one scenario to its end. Whatever goes wrong inside becomes a record, `crashed` where it was the policy,
+    `invalid` where it was anything else; but for a shared renderer that has ended: then it raises RendererLost, and is
+    to be run again.
 
     watches, waiting: see `Episode`. comparing: told how far the comparison with the street without the robot has come.
     """
@@ -55,8 +58,12 @@ def run_episode(
     except RendererLost:
         raise
     except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
-        crashed = msgspec.structs.replace(episode.record, status="crashed", reason=in_words(error))
-        return Outcome(crashed, None, traceback.format_exc())
+        by_policy = isinstance(error, PolicyError)
+        status: Status = "crashed" if by_policy else "invalid"
+        record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
+        another_time = isinstance(error, EngineError) or not isinstance(error, CosimError)
+        again = another_time and not isinstance(error, DirectorLost)
+        return Outcome(record, None, traceback.format_exc(), again)
     if options.counterfactual:
         try:
             measures = record.measures | beside.compared(episode.scenario, entrances, comparing).measures

@@ -7,19 +7,20 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.episode.log import Log
 from cosim.episode.step import Step
-from cosim.judge.event_monitor import EventMonitor, why_invalid
+from cosim.judge.event_monitor import EventMonitor, Hidden, why_invalid
 from cosim.judge.metrics import EpisodeFacts, every_metric
 from cosim.judge.referee import Failure, Referee, Verdict
 from cosim.judge.traffic import TrafficMonitor
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.records.record import Record, Recorder, TriggeredEvent
 from cosim.spec.event_kind import EventKinds
+from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
 
 
 class Scorer:
     """Takes in the Steps of one episode, in order. kinds: the table of its events; area: where the robot may be;
-    footprint_m: its length and width."""
+    hidden: see `EventMonitor`."""
 
     def __init__(
         self,
@@ -27,13 +28,14 @@ class Scorer:
         kinds: EventKinds,
         street_map: StreetMap,
         area: WalkableArea,
-        footprint_m: tuple[float, float],
+        robot: Robot,
+        hidden: Hidden,
         clock: Clock,
     ) -> None:
-        self._scenario = scenario
+        self._scenario, self._clock, footprint_m = scenario, clock, robot.footprint_m
         self._referee = Referee(scenario, area, footprint_m, clock)
-        self._recorder = Recorder(clock.tick_s)
-        self._monitor = EventMonitor(scenario, kinds, clock.tick_ms)
+        self._recorder = Recorder(clock.tick_s, footprint_m)
+        self._monitor = EventMonitor(scenario, kinds, robot, hidden, clock.tick_ms)
         self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
         self._walked_into: list[Failure] = []
@@ -56,8 +58,9 @@ class Scorer:
         broken = sum(event.rule_met is False for event in events)
         ended, failures = self._verdict.ended, tuple(self._failures)
         into = tuple(self._walked_into)
-        seen = EpisodeFacts(log, failures, self._red_lights, ended, scenario.route_line.length_m, broken, into)
-        reason = unseen(scenario, events)
+        length_m, period = scenario.route_line.length_m, self._clock.policy_ms // self._clock.tick_ms
+        seen = EpisodeFacts(log, failures, self._red_lights, ended, length_m, broken, into, period)
+        reason = "" if failures or ended not in ("goal", "stop") else unseen(scenario, events)
         record = msgspec.structs.replace(
             begun,
             status="invalid" if reason else "done",
@@ -74,7 +77,8 @@ class Scorer:
 
 
 def unseen(scenario: Scenario, events: tuple[TriggeredEvent, ...]) -> str:
-    """Why an episode that is about its event says nothing about the robot; "" if it does.
+    """Why an episode that is about its event says nothing about the robot that came by; "" if it does. Whoever fails
+    before it comes by has failed.
 
     A long way has events that a robot may fail to come to; there this makes nothing invalid.
     """

@@ -27,6 +27,10 @@ class Worker(Protocol):
     def question(self) -> Question | None:
         """What its policy is asked right now, or was asked when it ended; None where nothing can be known."""
 
+    @property
+    def in_engine(self) -> bool:
+        """Whether it was a fault of compiled code that ended it, while its policy was asked nothing."""
+
     def give(self, job: Job) -> None:
         """Hand it a job. One that has died does not hear it: the next `listen` tells."""
 
@@ -75,6 +79,7 @@ class _Here:
 
     log = "this process's own output"
     question: Question | None = None
+    in_engine = False
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver

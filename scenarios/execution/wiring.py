@@ -111,7 +111,7 @@ def staged(
             parts=Parts(world, crowd, injected, camera),
             robot=robot,
             renderer=renderer,
-            scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot.footprint_m, clock),
+            scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock),
             known=lambda now: known(scenario, free(), now),
             eyes=eyes,
             injected=injected,

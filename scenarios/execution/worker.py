@@ -126,7 +126,8 @@ def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, b
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
     log = b"" if outcome.log is None else outcome.log.encoded()
-    return Done(name, outcome.record.status, outcome.record.encoded(), log), bool(outcome.traceback)
+    done = Done(name, outcome.record.status, outcome.record.encoded(), log, outcome.again)
+    return done, bool(outcome.traceback)
 
 
 def _watcher(job: Job, say: Hear) -> Watch:

@@ -36,7 +36,7 @@ def sheet_of_run(folder: Path, kinds: EventKinds = EVENT_KINDS) -> pd.DataFrame:
     rows = []
     for record in sorted(read_records(folder), key=lambda r: r.scenario):
         path = folder / "episodes" / record.scenario / "trajectory.npz"
-        if record.status != "crashed" and path.exists():
+        if record.ended is not None and path.exists():
             rows += rows_of(scenarios[record.scenario], record, Log.load(path), kinds)
     return pd.DataFrame(rows, columns=list(COLUMNS))
 

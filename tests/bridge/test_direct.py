@@ -167,7 +167,7 @@ def test_a_director_killed_in_mid_episode_leaves_no_trace(tmp_path: Path) -> Non
 
 
 def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> None:
-    """Killed for good while an episode runs: the run says that it waits, and that episode has crashed."""
+    """Killed for good while an episode runs: the run says that it waits, and that the simulator owes it."""
     write_suite(Suite(name="tiny", version="1", scenarios=(frontal("t-1"),)), tmp_path / "tiny.json")
     (tmp_path / "killer.py").write_text(KILLER)
     words = ("run", "tiny.json", "--policy", "killer:Killer", "--out", "run", "--director", at_socket(tmp_path))
@@ -175,12 +175,12 @@ def test_a_director_that_stays_away_is_told(tmp_path: Path, cosim: Cosim) -> Non
         direct()
         run = cosim(*words, "--director-wait", "5", cwd=tmp_path)
     lost = recorded(tmp_path, "t-1")
-    assert run.returncode == 1 and lost["status"] == "crashed"
+    assert run.returncode == 1 and lost["status"] == "invalid"
     assert "nobody answered on 'cosim/run/env/t-1/director' for 5 s" in lost["reason"]
     assert "t-1: waits at tick" in run.stderr and "5 s at most" in run.stderr
 
 
-def test_a_director_that_lies_crashes_its_episodes_and_no_other(tmp_path: Path, cosim: Cosim) -> None:
+def test_a_director_that_lies_spoils_its_episodes_and_no_other(tmp_path: Path, cosim: Cosim) -> None:
     """The last tick's answer, too many states, noise, other code, an exception: each a record with its reason."""
     says = {
         "late": "it answered tick 2 of 'late'",
@@ -205,7 +205,7 @@ def test_a_director_that_lies_crashes_its_episodes_and_no_other(tmp_path: Path, 
     assert run.returncode == 1 and recorded(tmp_path, "honest")["status"] == "done", run.stderr
     for name, words in says.items():
         record = recorded(tmp_path, name)
-        assert record["status"] == "crashed" and words in record["reason"] and len(record["reason"]) < 1000
+        assert record["status"] == "invalid" and words in record["reason"] and len(record["reason"]) < 1000
         assert f"director, tick 3 of '{name}'" in record["reason"]
 
 

@@ -160,7 +160,9 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, 
     for name in table.index:
         assert (whole_run / "episodes" / name / "trajectory.npz").exists()
     shown = cosim("show", "whole", cwd=desk)
-    assert shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, finished 3, crashed 0" in shown.stdout
+    assert (
+        shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, scored 3, of these crashed 0" in shown.stdout
+    )
     one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
     assert one.returncode == 0, one.stderr
     assert (desk / "above.png").stat().st_size > 5000

@@ -25,7 +25,8 @@ def log(s_m: list[float], *, resets: dict[int, float] | None = None, person_m: f
     return Log(
         tick_s=0.05, pose=np.column_stack([s, np.zeros(n), np.zeros(n)]),
         speed=np.column_stack([moved / 0.05, np.zeros(n)]), command=np.zeros((n, 2)), route_s_m=s, travelled_m=moved,
-        person_m=np.full(n, person_m), reset_s_m=reset, waits_at_red=np.zeros(n, bool),
+        person_m=np.full(n, person_m), clearance_m=np.full(n, person_m - 0.65), collision_in_s=np.full(n, np.inf),
+        reset_s_m=reset, waits_at_red=np.zeros(n, bool),
         on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
         people_tick=np.zeros(0, np.int64), people_xy=np.zeros((0, 2)), people_kind=np.zeros(0, np.int8),
         people_age=np.zeros(0, np.int8),
@@ -149,3 +150,35 @@ def test_who_walks_into_a_robot_that_stands_is_counted_and_costs_it_nothing() ->
     facts = episode(log([0.05 * (i + 1) for i in range(2000)]), ended="goal")
     measures = every_metric(replace(facts, walked_into=(failure("collision", "pedestrian"),) * 2))
     assert [measures[name] for name in ("success", "collisions", "failures_per_100m", "walked_into")] == [1, 0, 0, 2]
+
+
+def test_accelerations_and_jerks_are_of_the_policys_periods() -> None:
+    """A command a quarter of a second: 0, 0.5, 1.5, 1.5 m/s at their ends are 2, 4, 0 m/s2, so 8 and -16 m/s3."""
+    one = log([0.05] * 15)
+    one.speed[:, 0] = np.repeat([0.5, 1.5, 1.5], 5)
+    measures = every_metric(episode(one))
+    assert measures["acceleration_mean_mps2"] == pytest.approx((2.0 + 4.0 + 0.0) / 3)
+    assert measures["jerk_mean_mps3"] == pytest.approx((8.0 + 16.0) / 2)
+
+
+def test_a_reset_is_no_deceleration() -> None:
+    """Put at rest at 1 m/s and driven on at 1 m/s: the jump is left out, the new start counts."""
+    one = log([0.05 * (i + 1) for i in range(20)], resets={9: 0.5})
+    one.speed[:, 0] = 1.0
+    assert every_metric(episode(one))["acceleration_mean_mps2"] == pytest.approx((4.0 + 0.0 + 4.0 + 0.0) / 4)
+
+
+def test_shares_of_episodes_count_an_episode_once() -> None:
+    """Two collisions with people and one with a wall: one episode that hit a person, one that hit something else."""
+    hits = (failure("collision", "pedestrian"), failure("collision", "pedestrian"), failure("collision", "wall"))
+    measures = every_metric(episode(log([1.0, 2.0]), *hits))
+    assert (measures["pedestrian_collision"], measures["other_collision"], measures["left_lane"]) == (1.0, 1.0, 0.0)
+    assert measures["failures_per_100m_route"] == 3.0
+
+
+def test_the_nearest_of_a_success_is_absent_from_a_failure() -> None:
+    """The paper averages it over successful episodes."""
+    drive = log([50.0, 100.0], person_m=0.9)
+    good, bad = (every_metric(episode(drive, ended=ended)) for ended in ("goal", "timeout"))
+    assert (good["pedestrian_distance_min_success_m"], bad["pedestrian_distance_min_success_m"]) == (0.9, None)
+    assert bad["clearance_min_m"] == pytest.approx(0.25)

@@ -44,7 +44,8 @@ def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: flo
     return Record(
         scenario=name, scenario_hash="h", suite="s", suite_hash=SUITE.content_hash, seed=0, robot="courier", policy="p",
         policy_version="1", goal_protocol="none", renderer="none", versions={"numpy": "2"}, status=status,
-        ended="goal", ticks=3, state_hash="abc", measures=measures, clock={"wall_s": wall_s},
+        ended="goal" if status == "done" else None, ticks=3, state_hash="abc", measures=measures,
+        clock={"wall_s": wall_s},
     )  # type: ignore[arg-type]  # fmt: skip
 
 
@@ -284,13 +285,14 @@ def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> 
 
 
 def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
-    """Crashed episodes stay in the mean of SR and RC as 0, and are absent where they have no value."""
+    """Crashed episodes stay in the means as the worst there is, and are absent where there is no worst."""
     crashed = msgspec.structs.replace(record("s-1", status="crashed"), measures={}, reason="boom")
     table = table_of([record("s-0"), crashed])
     summary = summary_of(table)
     assert summary.loc["success", "mean"] == 0.5
     assert summary.loc["success", "n"] == 2
-    assert summary.loc["velocity_mean_mps", "n"] == 0
+    assert (summary.loc["velocity_mean_mps", "mean"], summary.loc["pedestrian_collision", "mean"]) == (0.0, 1.0)
+    assert summary.loc["stalled_time_s", "n"] == 0
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
@@ -321,7 +323,10 @@ def test_a_log_survives_the_disk(tmp_path: Path) -> None:
         "people_xy": np.ones((1, 2)),
         "event_tracks": np.ones((1, 5)),
     }
-    names = ("route_s_m", "travelled_m", "person_m", "reset_s_m", "waits_at_red", "on_carriageway", "vehicles_braked")
+    names = (
+        "route_s_m", "travelled_m", "person_m", "clearance_m", "collision_in_s", "reset_s_m", "waits_at_red",
+        "on_carriageway", "vehicles_braked",
+    )  # fmt: skip
     vectors = {name: np.ones(2) for name in names}
     log = Log(
         tick_s=0.05,

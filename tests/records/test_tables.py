@@ -11,8 +11,19 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cosim.cli.tables import BY_KIND, COUNTS, LETTERS, SHOWN, print_by_kind, print_scenarios, print_sheet, print_table
+from cosim.cli.tables import (
+    BY_KIND,
+    COUNTS,
+    LETTERS,
+    NEAREST,
+    SHOWN,
+    print_by_kind,
+    print_scenarios,
+    print_sheet,
+    print_table,
+)
 from cosim.core.errors import unknown
+from cosim.judge.metrics import METRICS
 from cosim.spec.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, load_suite
 from scenarios.viewing.eventsheet import COLUMNS
@@ -44,7 +55,7 @@ def test_a_name_with_brackets_is_shown_as_it_is() -> None:
 
 def test_a_bad_run_fits_80_columns() -> None:
     """The longest shipped name, two digits before every point, and dozens of failures: nothing is cut."""
-    row = {"scenario": "ped_crossing-001", "status": "done", "ended": "timeout", "reason": ""}
+    row = dict.fromkeys(METRICS, 34.56) | {"scenario": "ped_crossing-001", "status": "done", "ended": "timeout"}
     row |= {name: 34.56 for name, _ in SHOWN} | {name: 120 for name, _ in COUNTS}  # type: ignore[dict-item]
     out, said = terminal()
     print_table(out, pd.DataFrame([row]), 1)
@@ -54,9 +65,10 @@ def test_a_bad_run_fits_80_columns() -> None:
 
 def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
     """Two short episodes of two events; a collision each: 1 in the episode, 8.48 in 100 m."""
-    row = {"status": "done", "ended": "failure", "reason": ""}
+    row = dict.fromkeys(METRICS, 1.0) | {"status": "done", "ended": "failure", "reason": ""}
     row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *BY_KIND)}  # type: ignore[dict-item]
-    row |= {"collisions": 1.0, "collisions_per_100m": 8.48, "pedestrian_distance_min_m": 0.5}  # type: ignore[dict-item]
+    row |= dict.fromkeys(NEAREST, 0.5)
+    row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
     names = ("ped_crossing-001", "frontal-001")
     return pd.DataFrame([row | {"scenario": n} for n in names]), {n: n.rsplit("-", 1)[0] for n in names}
 
@@ -69,7 +81,7 @@ def test_a_letter_means_one_thing_in_every_table() -> None:
     print_by_kind(shares[0], table, kinds)
     assert "8.48" in episodes[1].getvalue() and "C/OL/F" not in episodes[1].getvalue()
     heads = shares[1].getvalue().split("ped_crossing")[0].split()
-    assert "collided" in heads and not {"RC", "FC", "C", "OL", "F", "V"} & set(heads)
+    assert "person" in heads and not {"RC", "FC", "C", "OL", "F", "V"} & set(heads)
 
 
 def test_every_letter_and_heading_is_explained_under_its_table() -> None:

@@ -36,7 +36,8 @@ def log_of(x_m: np.ndarray, tracks: np.ndarray) -> Log:
     travelled = np.diff(x_m, prepend=0.0)
     return Log(
         tick_s=TICK_S, pose=pose, speed=np.zeros((n, 2)), command=np.zeros((n, 2)), route_s_m=x_m,
-        travelled_m=travelled, person_m=np.ones(n), reset_s_m=np.full(n, np.nan), waits_at_red=np.zeros(n, bool),
+        travelled_m=travelled, person_m=np.ones(n), clearance_m=np.ones(n),
+        collision_in_s=np.ones(n), reset_s_m=np.full(n, np.nan), waits_at_red=np.zeros(n, bool),
         on_carriageway=np.zeros(n, bool), vehicles_braked=np.zeros(n, int),
         people_tick=np.zeros(0, int), people_xy=np.zeros((0, 2)), people_kind=np.zeros(0, np.int8),
         people_age=np.zeros(0, np.int8), event_tracks=tracks,
@@ -96,7 +97,7 @@ def test_a_run_of_one_event_and_its_sheet_as_a_user_asks_for_them(tmp_path: Path
     words = ("run", "tiny.json", "--event", "gesturing", "--policy", "orca", "--out", "mine")
     run = cosim(*words, cwd=tmp_path)
     assert run.returncode == 0, run.stderr
-    assert "scheduled 1, finished 1" in run.stdout
+    assert "scheduled 1, scored 1" in run.stdout
     shown = cosim("show", "mine", "--events", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert "gesturing" in shown.stdout and "frontal" not in shown.stdout and "trigger m" in shown.stdout

@@ -163,7 +163,7 @@ def test_a_hostile_policy_is_recorded_for_what_it_did(war: War, name: str) -> No
 def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
     """A row for every episode, exit code 1, no traceback."""
     assert war.said.returncode == 1 and "Traceback" not in war.said.stderr, war.said.stderr
-    assert f"scheduled {len(EXPECTED)}, finished {len(EXPECTED)}" in war.said.stdout
+    assert f"scheduled {len(EXPECTED)}, scored {len(EXPECTED)}" in war.said.stdout
     assert "crashed error" in war.said.stdout and EXPECTED["error"] in war.said.stdout
     table = pd.read_csv(war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""])
     assert list(table.index) == sorted(EXPECTED)

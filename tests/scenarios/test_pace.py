@@ -105,6 +105,7 @@ def finished(folder: RunFolder, scenario: Scenario, status: str) -> None:
     record = Record(
         scenario=scenario.id, scenario_hash="", suite="s", suite_hash="", seed=0, robot="courier", policy="route",
         policy_version="1", goal_protocol="route", renderer=GL, versions=versions(), status=status, ticks=1600,
+        ended="goal" if status == "done" else None,
         clock={"wall_s": 20.0, "setup_s": 4.0},
     )  # fmt: skip
     folder.episode_folder(scenario.id).mkdir()

@@ -22,7 +22,7 @@ from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.execution import pool
 from scenarios.execution.asked import Asked, Patience, Question
-from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Ready
+from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Progress, Ready
 from scenarios.execution.shepherd import BoundedLog
 from scenarios.execution.wire import Wire
 from scenarios.rendering.shared import End, SharedRenderer
@@ -151,7 +151,10 @@ class Fake:
 
     log = "worker-0.log"
 
-    def __init__(self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False) -> None:
+    def __init__(
+        self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False, in_engine: bool = False
+    ) -> None:
+        self.in_engine = in_engine
         self.question = None if asks is None else Question(time.monotonic(), asks, 64)
         self.killed, self._messages, self._ends = False, messages, ends
 
@@ -268,6 +271,32 @@ def test_a_record_and_its_log_are_written_as_they_came(tmp_path: Path) -> None:
     assert (folder / "trajectory.npz").read_bytes() == log and (folder / "record.json").read_bytes() == data
     assert (folder / "frames" / "000005.png").read_bytes() == b"png" and record.encoded() == data
     assert not list((tmp_path / "run").rglob("*.part"))
+
+
+@pytest.mark.parametrize(
+    ("in_engine", "status"), [(True, "invalid"), (False, "crashed")], ids=["a fault of an engine", "anything else"]
+)
+def test_who_ends_its_process_gains_nothing_and_who_loses_it_to_an_engine_nothing_either(
+    tmp_path: Path, in_engine: bool, status: str
+) -> None:
+    """Twice lost to a fault of compiled code while nothing was asked of the policy: the simulator owes the episode.
+    However else a process ends, its policy may have ended it: that has failed."""
+    dies = [Fake(Ready(), Progress("s-0", 1.0, 1.0, 0), ends=True, in_engine=in_engine) for _ in range(2)]
+    (record,) = all_pooled(tmp_path, (SCENARIO,), *dies)
+    assert record.status == status and record.reason.startswith("the environment process ended with exit code 7, 2")
+
+
+def test_an_engine_that_fails_is_tried_again(tmp_path: Path) -> None:
+    """One error is forgotten; after the second the episode is invalid, with its reason."""
+    failed = msgspec.structs.replace(
+        begun(SCENARIO, load_policy("stop").manifest, "h"), status="invalid", reason="gone"
+    )
+    fine = Done("s-0", "done", msgspec.structs.replace(failed, status="done", reason="").encoded())
+    once = Again(Ready(), Done("s-0", "invalid", failed.encoded(), again=True), fine)
+    assert all_pooled(tmp_path / "once", (SCENARIO,), once)[0].status == "done"
+    twice = Again(Ready(), *[Done("s-0", "invalid", failed.encoded(), again=True)] * 2)
+    (record,) = all_pooled(tmp_path / "twice", (SCENARIO,), twice)
+    assert record.status == "invalid" and record.reason == "gone, 2 times; see logs/ in the run folder"
 
 
 class DiesIdle(Fake):
