@@ -23,6 +23,7 @@ from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenar
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
 from scenarios.builders.drawing import TRIES, Refusals, bare_scenario, first_of, people_of, wider_m
 from scenarios.builders.hems import hem
+from scenarios.builders.obstacles import with_obstacles
 from scenarios.events import EVENT_KINDS
 
 _TO_SPARE_M = 0.045
@@ -131,7 +132,8 @@ def _along(
         robot=draft.robot,
     )
     events = draw_events(street_map, route, way, rng, draft.robot, draft.kinds)
-    return msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
+    whole = msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
+    return with_obstacles(whole, street_map)
 
 
 def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], Scenario]]:

@@ -21,6 +21,7 @@ from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.drawing import bare_scenario, first_that_fits, people_of, wider_m
 from scenarios.builders.long_horizon import route_crossings
+from scenarios.builders.obstacles import with_obstacles
 
 _LIMIT_S = 60.0
 CROWD = CrowdSpec(persons=12, radius_m=80.0, vehicles=8)
@@ -83,7 +84,8 @@ def build_reactive(
             robot=robot,
         )
         event = _event_at(kind, at, rng, robot)
-        return msgspec.structs.replace(bare, events=(event,), crowd=CROWD, ends_on_failure=True, ends_at=kind.ends_at)
+        whole = msgspec.structs.replace(bare, events=(event,), crowd=CROWD, ends_on_failure=True, ends_at=kind.ends_at)
+        return with_obstacles(whole, street_map, beside=True)
 
     return first_that_fits(draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}")
 
