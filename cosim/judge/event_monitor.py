@@ -155,8 +155,9 @@ def went_between(before: Floats, after: Floats, people: Floats) -> bool:
 
 
 def _cross(a: Floats, b: Floats, c: Floats, d: Floats) -> bool:
-    """Whether the open segments ab and cd meet."""
-    return bool(_side(a, b, c) * _side(a, b, d) < 0.0 and _side(c, d, a) * _side(c, d, b) < 0.0)
+    """Whether the step ab leads over the open segment cd; one that ends on it, or the next one, but not both."""
+    over = (_side(c, d, a) >= 0.0) != (_side(c, d, b) >= 0.0)
+    return bool(over and _side(a, b, c) * _side(a, b, d) < 0.0)
 
 
 def _side(a: Floats, b: Floats, p: Floats) -> float:

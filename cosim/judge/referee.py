@@ -34,8 +34,9 @@ import shapely
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
-from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, RobotState, Signal
+from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, Signal
 from cosim.episode.step import Reset, Step
+from cosim.people.yielding import ROBOT_STANDS_MPS, STOOD_S, outline_mps
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventState
 from cosim.spec.obstacle import footprint
@@ -55,9 +56,6 @@ SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
-ROBOT_STANDS_MPS = 0.05
-STOOD_S = 1.0
-"""A robot that has stood for so long, slower than ROBOT_STANDS_MPS at every point of its outline, is walked into."""
 STOP_S = 2.0
 STOP_WITHIN_M = 3.0
 """Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
@@ -161,7 +159,7 @@ class Referee:
     def _contacts(self, step: Step) -> list[Failure]:
         """The contacts that begin in a tick, one for each thing."""
         self._forget_the_parted(step)
-        moves = outline_mps(step.robot, self._half_m) >= ROBOT_STANDS_MPS
+        moves = outline_mps(step.robot.v_mps, step.robot.w_radps, self._half_m) >= ROBOT_STANDS_MPS
         self._still_ticks = 0 if moves else self._still_ticks + 1
         stood = self._still_ticks >= self._clock.ticks(STOOD_S)
         drives_on = self._walked_into if moves and step.command != STILL else set()
@@ -308,11 +306,6 @@ def vehicles_within(step: Step, half_m: tuple[float, float], gap_m: float) -> se
     boxes = np.column_stack([vehicles.xy, vehicles.heading])
     near = boxes_overlap(np.array(pose), np.array(half_m) + gap_m, boxes, vehicles.size / 2)
     return {vehicles.ids[i] for i in np.flatnonzero(near)}
-
-
-def outline_mps(robot: RobotState, half_m: tuple[float, float]) -> float:
-    """How fast the fastest point of a robot's outline moves, at most."""
-    return abs(robot.v_mps) + abs(robot.w_radps) * math.hypot(*half_m)
 
 
 def fault_of(person: str, stood: bool, step: Step) -> Fault:

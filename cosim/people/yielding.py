@@ -23,9 +23,18 @@ DRAWS_BACK_M = 0.015
 """Who stands nearer to the robot than KEEP_M goes back by this in a step of 0.05 s."""
 
 TOUCH_M = 0.01
+ROBOT_STANDS_MPS: Final = 0.05
+STOOD_S: Final = 1.0
+"""A robot of which no point has moved faster than ROBOT_STANDS_MPS for so long stands, for people and for the referee:
+they walk round it, and who walks into it is at fault."""
 _ROUNDING_M: Final = 1e-6
 FORESEEN_S = 0.6
 """How far ahead people see the robot come: nobody walks into the ground it will cover in this time."""
+
+
+def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> float:
+    """How fast the fastest point of a robot's outline moves, at most."""
+    return abs(v_mps) + abs(w_radps) * math.hypot(*half_m)
 
 
 class RobotBody(NamedTuple):

@@ -25,7 +25,7 @@ class Event(Ranged, frozen=True, kw_only=True):
     x_m, y_m, heading_rad: the place on the middle of the sidewalk (of the crosswalk) where it happens, heading along
     the robot's direction of travel. half_width_m: from there to either edge. half_length_m: of a crosswalk, from there
     to either end along the heading. route_s_m: the same place as arc length of the reference route. people: how many.
-    speed_mps: walking speed. hold_s: how long those stay who stand. side: of the sidewalk, left (1) or right (-1).
+    speed_mps: walking speed. side: of the sidewalk, left (1) or right (-1).
     """
 
     id: str
@@ -36,7 +36,6 @@ class Event(Ranged, frozen=True, kw_only=True):
     route_s_m: Annotated[float, ALONG_M]
     half_width_m: Annotated[float, Within(PERSON_RADIUS_M, 50, above=True)]
     speed_mps: Annotated[float, Within(0, 3, above=True)] = 1.3
-    hold_s: Annotated[float, Within(0, 3600)] = 20.0
     side: Literal[-1, 1] = 1
     people: Annotated[int, Within(0, 100)] = 1
     half_length_m: Annotated[float, Within(0, 50)] = 0.0
@@ -63,7 +62,8 @@ class Event(Ranged, frozen=True, kw_only=True):
 class Walker(msgspec.Struct, frozen=True, kw_only=True):
     """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
 
-    blocked_ticks: how long it has stood against the robot. vx_mps, vy_mps: of its last step.
+    blocked_ticks: how long it has stood against the robot. counted_ticks: how long that lasts which ends its event.
+    vx_mps, vy_mps: of its last step.
     """
 
     x_m: float
@@ -72,6 +72,7 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
     aim_rad: float | None = None
     pace_mps: float | None = None
     blocked_ticks: int = 0
+    counted_ticks: int = 0
     vx_mps: float = 0.0
     vy_mps: float = 0.0
 
@@ -80,6 +81,7 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
     """Where an event stands. phase: waiting for its trigger, acting, over, or gone for good. since_tick: in this phase.
 
     trigger_distance_m: along the route from the robot to the event's place when it triggered, negative behind it.
+    lane_m: how far left of the middle of the way the robot was then. robot_stood_ticks: how long the robot has stood.
     """
 
     phase: Literal["waiting", "acting", "over", "gone"]
@@ -87,6 +89,8 @@ class EventState(msgspec.Struct, frozen=True, kw_only=True):
     walkers: tuple[Walker, ...]
     triggered_tick: int | None = None
     trigger_distance_m: float | None = None
+    lane_m: float = 0.0
+    robot_stood_ticks: int = 0
 
 
 class Actor(msgspec.Struct, frozen=True, kw_only=True):

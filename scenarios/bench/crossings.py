@@ -20,7 +20,8 @@ from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.episode.driver import Driver
 from cosim.episode.step import Step
-from cosim.judge.referee import ROBOT_STANDS_MPS, Verdict
+from cosim.judge.referee import Verdict
+from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.spec.scenario import City, Scenario

@@ -2,7 +2,8 @@
 
 Who steps round somebody on the way takes aim anew.
 
-One that has run into the robot does not push it: it stands, gives up, and goes round.
+A robot that has stood for a second is walked round. One that has run into the robot does not push it: it stands, gives
+up, and goes round.
 """
 
 from __future__ import annotations
@@ -10,12 +11,10 @@ from __future__ import annotations
 import math
 from typing import Final
 
-import msgspec
-
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import gave_up, pressed_on, walked_on, walker_at
+from scenarios.events.walking import aimed, gave_up, pressed_on, walked_on, walker_at
 
 COMMIT_M: Final = 5.0
 """It aims at the robot's current position until this close, then keeps its line as people do."""
@@ -27,13 +26,11 @@ def _begin(event: Event, number: int) -> Walker:
 
 def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
     walker, sight = state.walkers[number], sight_of(event, number, query)
+    on_rad = event.heading_rad + math.pi
     if state.phase == "over":
-        return walked_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
-    dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
-    heading = walker.aim_rad if walker.aim_rad is not None else math.atan2(dy, dx)
-    if walker.aim_rad is None and math.hypot(dx, dy) <= COMMIT_M:
-        walker = msgspec.structs.replace(walker, aim_rad=heading)
-    return pressed_on(walker, heading, event.speed_mps, sight)
+        return walked_on(walker, on_rad, event.speed_mps, sight)
+    walker, heading_rad = (walker, on_rad) if sight.robot_stands else aimed(walker, query, COMMIT_M)
+    return pressed_on(walker, heading_rad, event.speed_mps, sight)
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:

@@ -16,9 +16,9 @@ from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
 from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, walker_at
 
-SLOWEST_MPS: Final = 0.2
+SLOWEST_MPS: Final = 0.05
 _FASTEST_MPS: Final = 2.0
-"""A robot that stands is crossed before at the slowest pace; nobody runs faster than this."""
+"""However slow the robot, it is met; nobody runs faster than this."""
 
 
 def _begin(event: Event, number: int) -> Walker:

@@ -8,9 +8,11 @@ import msgspec
 
 from cosim.core.errors import SpecError
 from cosim.core.state import PersonKind
+from cosim.people.yielding import ROBOT_STANDS_MPS, outline_mps
 from cosim.spec.event_kind import EventKind, EventKinds
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
 from scenarios.events.table import EVENT_KINDS
+from scenarios.events.walking import left_m
 
 SHOWN_AHEAD_M = 60.0
 SHOWN_BEHIND_M = 30.0
@@ -59,15 +61,21 @@ def _triggered_m(trigger_m: float | None, event: Event, query: EventQuery) -> fl
 
 
 def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery) -> EventState:
+    if state.phase == "gone":
+        return state
+    state = msgspec.structs.replace(state, robot_stood_ticks=state.robot_stood_ticks + 1 if _stands(query) else 0)
     if state.phase == "waiting":
         gap_m = _triggered_m(kind.trigger_m, event, query)
         if gap_m is None:
             return state
         state = msgspec.structs.replace(
-            state, phase="acting", since_tick=query.tick, triggered_tick=query.tick, trigger_distance_m=gap_m
+            state,
+            phase="acting",
+            since_tick=query.tick,
+            triggered_tick=query.tick,
+            trigger_distance_m=gap_m,
+            lane_m=left_m(event, query.robot_x_m, query.robot_y_m),
         )
-    if state.phase == "gone":
-        return state
     if state.phase == "over" and all(
         math.hypot(w.x_m - query.robot_x_m, w.y_m - query.robot_y_m) > LEAVES_M for w in state.walkers
     ):
@@ -77,6 +85,11 @@ def _advance(kind: EventKind, event: Event, state: EventState, query: EventQuery
     after = (kind.step(event, state, number, query) for number in range(event.people))
     walkers = tuple(_timed(old, new, query.tick_ms) for old, new in zip(state.walkers, after, strict=True))
     return msgspec.structs.replace(state, walkers=walkers)
+
+
+def _stands(query: EventQuery) -> bool:
+    half_m = query.robot_length_m / 2, query.robot_width_m / 2
+    return outline_mps(query.robot_v_mps, query.robot_w_radps, half_m) < ROBOT_STANDS_MPS
 
 
 def _timed(old: Walker, new: Walker, tick_ms: int) -> Walker:

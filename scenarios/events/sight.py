@@ -11,6 +11,7 @@ import msgspec
 from cosim.core.state import PERSON_RADIUS_M, PersonKind
 from cosim.people.orca import HalfPlane
 from cosim.people.steering import HORIZON_S, ROOM_M, SHOULDER_TO_SHOULDER_M, Neighbour, Vector, steered
+from cosim.people.yielding import STOOD_S
 from cosim.spec.events import Event, EventQuery, NearbyPerson, Walker
 
 COMES_UP_M = 1.5
@@ -37,13 +38,15 @@ SHARED = 0.5
 class Sight(NamedTuple):
     """What somebody knows: the query, the people round it but not itself, the event on whose ground it stays.
 
-    room_m: what it keeps from others where it can.
+    room_m: what it keeps from others where it can. robot_stands: whether the robot has stood long enough to be walked
+    round like anything that stands.
     """
 
     query: EventQuery
     others: Sequence[Neighbour] = ()
     event: Event | None = None
     room_m: float = ROOM_M
+    robot_stands: bool = False
 
 
 def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0) -> Sight:
@@ -60,7 +63,17 @@ def sight_of(event: Event, number: int, query: EventQuery, waited_s: float = 0.0
     ]
     if waited_s < PRESSES_S:
         others += met(query.nearby)
-    return Sight(query, others, event, ROOM_M if waited_s < SQUEEZES_S else SHOULDER_TO_SHOULDER_M)
+    room_m = ROOM_M if waited_s < SQUEEZES_S else SHOULDER_TO_SHOULDER_M
+    ticks = max((state.robot_stood_ticks for state in query.states), default=0)
+    stands = ticks * query.tick_ms >= 1000 * STOOD_S
+    return Sight(query, others + standing_robot(query) if stands else others, event, room_m, stands)
+
+
+def standing_robot(query: EventQuery) -> list[Neighbour]:
+    """The robot as two who stand, one behind the other."""
+    quarter_m = query.robot_length_m / 4
+    cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
+    return [Neighbour(query.robot_x_m + m * cos, query.robot_y_m + m * sin) for m in (quarter_m, -quarter_m)]
 
 
 def sight_of_injected(name: str, person: Walker, query: EventQuery) -> Sight:

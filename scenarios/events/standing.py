@@ -1,6 +1,8 @@
 """Those who stand in the way: `obstructing`, `conversing`, `queueing`, `gesturing`.
 
-They wait at the edge of the sidewalk, step to their places when triggered, stay for their time, and step back.
+They wait at the edge of the sidewalk and step to their places when triggered: on the middle of the sidewalk, or before
+a robot that does not drive there, so that who only keeps its course meets them. They stay until the robot is past, and
+the stopping hand until the robot has stood before it; then they step back.
 """
 
 from __future__ import annotations
@@ -12,12 +14,14 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from cosim.core.geometry import wrap_angle
+from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
+from cosim.judge.referee import STOP_S, stands_before
+from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import edge_m, spot, turned, walked_to, walker_at
+from scenarios.events.walking import along_m, edge_m, spot, turned, walked_to, walker_at
 
 _TRIGGER_M: Final = 10.0
 LOOK_PERIOD_S: Final = 4.0
@@ -32,29 +36,47 @@ GROUP_M: Final = 1.95
 """Half the width of a sidewalk on which one can pass round a group of talkers in its middle."""
 WAITING_M: Final = 0.8
 """From one to the next of those who wait at the edge."""
+ON_THE_MIDDLE_M: Final = 0.3
+"""A robot no farther from the middle of the sidewalk is met there."""
+PASSED_BY_M: Final = 3.0
+"""So far beyond the last of them along the route the robot has passed them."""
 
+_Step = Callable[[Event, EventState, int, EventQuery], Walker]
 _Place = tuple[float, float]
 """Metres along the event's heading and to the left."""
+_Places = Callable[[Event, float], tuple[_Place, ...]]
+"""Of an event's people, given how far left of the middle the robot drove at the trigger."""
 _Facing = Callable[[Event, Walker, EventQuery, EventState], float]
 _PASSABLE: Final = SidewalkLayout((18.0, 20.0), (11.0, 13.0))
 
 
-def talking_places(event: Event) -> tuple[_Place, ...]:
-    """Evenly on a circle round the middle of the sidewalk, two of them abreast of the robot's way."""
+def _lane(lane_m: float, room_m: float) -> float:
+    """How far left of the middle of the sidewalk a robot is met that was `lane_m` left of it."""
+    return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > ON_THE_MIDDLE_M else 0.0
+
+
+def talking_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
+    """Evenly on a circle, two of them abreast of the robot's way."""
     radius_m = TALK_M * (1.15 if event.people == 4 else 1.0)
     angles = [math.pi / 2 + 2.0 * math.pi * k / event.people for k in range(event.people)]
-    return tuple((radius_m * math.cos(a), radius_m * math.sin(a)) for a in angles)
+    left_m = _lane(lane_m, max(edge_m(event) - radius_m, 0.0))
+    return tuple((radius_m * math.cos(a), left_m + radius_m * math.sin(a)) for a in angles)
 
 
-def queue_places(event: Event) -> tuple[_Place, ...]:
-    """A tight line across the sidewalk that begins at the edge of its side."""
+def queue_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
+    """A tight line across the sidewalk that begins at the edge of its side, or of the robot's."""
+    side = _queue_side(event, lane_m)
     first_m = event.half_width_m - PERSON_RADIUS_M
-    return tuple((0.0, event.side * (first_m - k * QUEUE_M)) for k in range(event.people))
+    return tuple((0.0, side * (first_m - k * QUEUE_M)) for k in range(event.people))
 
 
-def middle(event: Event) -> tuple[_Place, ...]:
-    """One person, in the middle."""
-    return ((0.0, 0.0),)
+def _queue_side(event: Event, lane_m: float) -> float:
+    return math.copysign(1.0, lane_m) if abs(lane_m) > ON_THE_MIDDLE_M else event.side
+
+
+def in_the_way(event: Event, lane_m: float) -> tuple[_Place, ...]:
+    """One person."""
+    return ((0.0, _lane(lane_m, edge_m(event))),)
 
 
 def _aside(event: Event, number: int) -> _Place:
@@ -67,18 +89,24 @@ def _begin(event: Event, number: int) -> Walker:
 
 
 def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
-    return (query.tick - state.since_tick) * query.tick_ms / 1000 >= event.hold_s
+    """The robot is past all of them."""
+    last_m = max(along_m(event, walker.x_m, walker.y_m) for walker in state.walkers)
+    return query.route_s_m - event.route_s_m >= max(last_m, 0.0) + PASSED_BY_M
 
 
-def _standing(
-    places: Callable[[Event], tuple[_Place, ...]], facing: _Facing
-) -> Callable[[Event, EventState, int, EventQuery], Walker]:
+def _obeyed(event: Event, state: EventState, query: EventQuery) -> bool:
+    """The robot has stopped before the hand, or is past it."""
+    (walker,) = state.walkers
+    return walker.counted_ticks * query.tick_ms / 1000 >= STOP_S or _ends(event, state, query)
+
+
+def _standing(places: _Places, facing: _Facing) -> _Step:
     """The steps of those who go to `places` and face somewhere there."""
 
     def step(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
         walker, acting = state.walkers[number], state.phase == "acting"
         tick_s = query.tick_ms / 1000
-        x_m, y_m = spot(event, *(places(event)[number] if acting else _aside(event, number)))
+        x_m, y_m = spot(event, *(places(event, state.lane_m)[number] if acting else _aside(event, number)))
         if (walker.x_m, walker.y_m) != (x_m, y_m):
             sight = sight_of(event, number, query, (query.tick - state.since_tick) * tick_s if acting else 0.0)
             return walked_to(walker, x_m, y_m, event.speed_mps, sight, insisting=acting)
@@ -90,6 +118,19 @@ def _standing(
     return step
 
 
+def _with_hand(step: _Step) -> _Step:
+    """Who counts besides how long the robot has stood before it."""
+
+    def counted(event: Event, state: EventState, number: int, query: EventQuery) -> Walker:
+        after = step(event, state, number, query)
+        pose = Pose(query.robot_x_m, query.robot_y_m, query.robot_heading_rad)
+        stands = abs(query.robot_v_mps) < ROBOT_STANDS_MPS and stands_before(pose, event, state)
+        ticks = after.counted_ticks + 1 if stands and state.phase == "acting" else 0
+        return msgspec.structs.replace(after, counted_ticks=ticks)
+
+    return counted
+
+
 def _about(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
     """Against the robot's way, swinging to either side."""
     phase = 2 * math.pi * (query.tick - state.since_tick) * query.tick_ms / 1000 / LOOK_PERIOD_S
@@ -98,12 +139,14 @@ def _about(event: Event, walker: Walker, query: EventQuery, state: EventState) -
 
 def _inward(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
     """To the middle of the group."""
-    return math.atan2(event.y_m - walker.y_m, event.x_m - walker.x_m)
+    places = talking_places(event, state.lane_m)
+    x_m, y_m = spot(event, 0.0, sum(left for _, left in places) / len(places))
+    return math.atan2(y_m - walker.y_m, x_m - walker.x_m)
 
 
 def _forward(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
     """To the head of the queue, at its side of the sidewalk."""
-    return wrap_angle(event.heading_rad + event.side * math.pi / 2)
+    return wrap_angle(event.heading_rad + _queue_side(event, state.lane_m) * math.pi / 2)
 
 
 def _at_robot(event: Event, walker: Walker, query: EventQuery, state: EventState) -> float:
@@ -122,7 +165,7 @@ OBSTRUCTING: Final = EventKind(
     on_long_ways=True,
     trigger_m=_TRIGGER_M,
     begin=_begin,
-    step=_standing(middle, _about),
+    step=_standing(in_the_way, _about),
     ends=_ends,
     pose="look",
 )
@@ -154,8 +197,8 @@ GESTURING: Final = EventKind(
     layout=_PASSABLE,
     trigger_m=_TRIGGER_M,
     begin=_begin,
-    step=_standing(middle, _at_robot),
-    ends=_ends,
+    step=_with_hand(_standing(in_the_way, _at_robot)),
+    ends=_obeyed,
     pose="stop",
     ends_at="stop",
 )

@@ -39,6 +39,11 @@ def along_m(event: Event, x_m: float, y_m: float) -> float:
     return math.cos(event.heading_rad) * (x_m - event.x_m) + math.sin(event.heading_rad) * (y_m - event.y_m)
 
 
+def left_m(event: Event, x_m: float, y_m: float) -> float:
+    """Metres of a point of the world to the left of the event's heading, from its place."""
+    return math.cos(event.heading_rad) * (y_m - event.y_m) - math.sin(event.heading_rad) * (x_m - event.x_m)
+
+
 def edge_m(event: Event) -> float:
     """How far from the middle one can stand with both shoulders on the sidewalk."""
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
@@ -109,9 +114,22 @@ def facing(walker: Walker, after: Vector, sight: Sight) -> float:
     return turned(walker.heading_rad, math.atan2(dy, dx), tick_s)
 
 
+def aimed(walker: Walker, query: EventQuery, commit_m: float) -> tuple[Walker, float]:
+    """The walker and where it heads (rad) who walks at the robot's current position, and keeps its line once it is so
+    near."""
+    dx, dy = query.robot_x_m - walker.x_m, query.robot_y_m - walker.y_m
+    if walker.aim_rad is not None:
+        return walker, walker.aim_rad
+    heading_rad = math.atan2(dy, dx)
+    commits = math.hypot(dx, dy) <= commit_m
+    return msgspec.structs.replace(walker, aim_rad=heading_rad) if commits else walker, heading_rad
+
+
 def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sight) -> Walker:
-    """One tick straight on whether or not the robot is there, but round people; one that meets the robot stands and
-    does not push it. Who is led round people takes aim anew."""
+    """One tick straight on whether or not the robot is there, but round people and round a robot that stands; one that
+    meets the robot stands and does not push it. Who is led round anybody takes aim anew."""
+    if sight.robot_stands:
+        return msgspec.structs.replace(walked_on(walker, heading_rad, speed_mps, sight), aim_rad=None)
     if touches(np.array([walker.x_m, walker.y_m]), robot_of(sight.query)):
         return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1)
     step_m = speed_mps * sight.query.tick_ms / 1000

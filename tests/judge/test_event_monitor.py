@@ -33,6 +33,13 @@ def test_between_two_people_is_across_the_line_between_them(
     assert went_between(np.array(before), np.array(after), pair) is between
 
 
+def test_a_step_that_ends_on_the_line_is_no_way_round_it() -> None:
+    """Of two steps over the line that meet on it one counts, in either direction."""
+    pair, ways = np.array([(0.0, -1.0), (0.0, 1.0)]), [np.array([x, 0.0]) for x in (-0.1, 0.0, 0.1)]
+    for a, b, c in (ways, ways[::-1]):
+        assert went_between(a, b, pair) is not went_between(b, c, pair)
+
+
 def test_any_two_of_a_group_count() -> None:
     """Into a triangle of talkers goes over one of its sides; past it over none."""
     trio = np.array([(0.0, 0.0), (2.0, 0.0), (1.0, 2.0)])

@@ -73,16 +73,17 @@ def test_an_event_triggers_at_its_distance(kind: str, trigger_m: float) -> None:
 
 
 def test_an_obstructing_pedestrian_waits_aside_then_stands_in_the_middle_and_leaves() -> None:
-    """It stands at the edge, walks to the middle when triggered, looks around, and steps back after its time."""
-    track = drive(event("obstructing", hold_s=5.0), 1400, 0.2, start_m=35.0)
+    """It stands at the edge, walks to the middle when triggered, looks around, and steps back when the robot is 3 m
+    past."""
+    track = drive(event("obstructing"), 1400, 0.4, start_m=35.0)
     waiting = [state for _, state, _ in track if state.phase == "waiting"]
     assert {(s.walkers[0].x_m, round(s.walkers[0].y_m, 9)) for s in waiting} == {(50.0, 1.6)}
-    acting = [(state, actor) for _, state, actor in track if state.phase == "acting"]
-    assert (acting[-1][0].walkers[0].x_m, acting[-1][0].walkers[0].y_m) == (50.0, 0.0)
-    assert acting[-1][1] is not None and acting[-1][1].doing == "look"
-    turns = [s.walkers[0].heading_rad for s, _ in acting[40:]]
+    acting = [(x, state, actor) for x, state, actor in track if state.phase == "acting"]
+    assert (acting[-1][1].walkers[0].x_m, acting[-1][1].walkers[0].y_m) == (50.0, 0.0)
+    assert acting[-1][2] is not None and acting[-1][2].doing == "look"
+    turns = [s.walkers[0].heading_rad for _, s, _ in acting[40:]]
     assert max(turns) - min(turns) > 1.0
-    assert len(acting) == pytest.approx(100, abs=1)
+    assert acting[-1][0] == pytest.approx(53.0, abs=0.021)
     assert track[-1][1].phase == "over" and track[-1][1].walkers[0].y_m == pytest.approx(1.6)
 
 
@@ -115,7 +116,7 @@ def test_a_frontal_pedestrian_walks_at_the_robot_until_it_commits_to_a_line() ->
 def test_event_pedestrians_walk_no_faster_than_told_and_never_jump() -> None:
     """Between two ticks no actor moves farther than its speed allows."""
     for kind in EVENT_KINDS:
-        fastest = {"lateral": 2.0, "overtaking": 2.2}.get(kind, 1.2)
+        fastest = {"lateral": 2.0, "overtaking": 2.1}.get(kind, 1.2)
         states = [state for _, state, _ in drive(event(kind), 1500, 1.3)]
         for a, b in itertools.pairwise(states):
             for old, new in zip(a.walkers, b.walkers, strict=True):
@@ -209,15 +210,17 @@ def test_a_lateral_pedestrian_meets_a_robot_that_keeps_its_velocity(speed_mps: f
     assert min(gaps) < 0.02
 
 
-def test_an_overtaking_pedestrian_passes_beside_the_robot() -> None:
-    """It starts from behind, is faster, never touches, and ends ahead in the middle of the sidewalk."""
+def test_an_overtaking_pedestrian_passes_beside_the_robot_and_cuts_in() -> None:
+    """It starts from behind, is faster, passes without a touch, and slows down ahead, on the robot's line."""
     track = drive(event("overtaking"), 900, 1.2, start_m=40.0)
     acting = [(x, s.walkers[0]) for x, s, _ in track if s.phase == "acting"]
-    assert -1.0 <= acting[0][1].x_m - acting[0][0] < -0.9
-    lead = [w.x_m - x for x, w in acting]
-    assert lead[-1] > 2.4 and all(b > a - 1e-9 for a, b in itertools.pairwise(lead))
-    assert min(abs(w.y_m) for x, w in acting if abs(w.x_m - x) < 0.65) > 0.275 + 0.3
-    assert track[-1][1].phase == "gone" or abs(track[-1][1].walkers[0].y_m) < 0.5
+    assert -1.0 <= acting[0][1].x_m - acting[0][0] < -0.85
+    passing = [(x, w) for x, w in acting if w.pace_mps is None]
+    lead = [w.x_m - x for x, w in passing]
+    assert lead[-1] > 1.4 and all(b > a - 1e-9 for a, b in itertools.pairwise(lead))
+    assert min(abs(w.y_m) for x, w in passing if abs(w.x_m - x) < 0.65) > 0.275 + 0.3
+    x, slow = next((x, w) for x, w in acting if w.pace_mps is not None)
+    assert slow.pace_mps == pytest.approx(0.6) and abs(slow.y_m) < 0.15 and slow.x_m - x < 2.5
 
 
 def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
@@ -236,7 +239,7 @@ def test_people_cross_from_both_ends_of_the_crosswalk() -> None:
 
 def test_a_gesturing_pedestrian_faces_the_robot_throughout() -> None:
     """In its place it holds up the hand, and turns with a robot that drives past."""
-    one = event("gesturing", hold_s=60.0)
+    one = event("gesturing")
     track = drive(one, 700, 0.5, start_m=39.0)
     shown = [(x, s.walkers[0], a) for x, s, a in track if s.phase == "acting"][80:]
     assert {a.doing for _, _, a in shown if a is not None} == {"stop"}

@@ -94,7 +94,6 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
     (("first", "crossings", 0, "leave_s_m"), 9e3, "leave_s_m is 9000, but the route ends at 183.155"),
     (("first", "events", 0, "route_s_m"), 9e3, "route_s_m is 9000, but the route ends at 183.155"),
     (("first", "events", 0, "half_width_m"), 1e9, "half_width_m must be in (0.3, 50], not 1000000000.0"),
-    (("first", "events", 0, "hold_s"), -1, "event 'e0': hold_s must be in [0, 3600], not -1"),
     (("first", "events", 0, "id"), "e <x>", "event id 'e <x>': ids of event pedestrians start with 'e'"),
     (("first", "events", 0, "kind"), "ambush", "Invalid enum value 'ambush' - at `$.scenarios[0].events[0].kind`. V"),
     (("first", "events", 0, "people"), 2, "people of 'obstructing' must be 1, not 2 - at `$.scenarios[0].events[0]`"),

@@ -1,0 +1,209 @@
+"""Who drives without looking meets the people of every event; who stands is not walked into."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose, box_disk_gap
+from cosim.judge.event_monitor import went_between
+from cosim.policies.orca import Orca
+from cosim.spec.events import Event, EventQuery, EventState
+from cosim.spec.scenario import City, CrowdSpec
+from scenarios.events import EVENT_KINDS, react
+from tests.cheats import BLIND_MPS, Crawl, EdgeDriver, Stander
+
+TICK_S = 0.05
+HALF_M = (0.35, 0.275)
+PEOPLE = {"conversing": (2, 3, 4), "queueing": (2, 3, 5), "ped_crossing": (1, 2, 3, 4)}
+HALF_WIDTHS_M = {"queueing": {2: 1.4, 3: 1.6, 5: 2.9}}
+STANDING = ("obstructing", "conversing", "queueing", "gesturing")
+
+
+def event(kind: str, half_width_m: float = 1.9, people: int = 1, side: int = 1, speed_mps: float = 1.2) -> Event:
+    """An event 50 m along a route on the x axis."""
+    length_m = 4.0 if kind == "ped_crossing" else 0.0
+    return Event(
+        id="e0", kind=kind, x_m=50.0, y_m=0.0, heading_rad=0.0, route_s_m=50.0, half_width_m=half_width_m,
+        half_length_m=length_m, people=people, side=side, speed_mps=speed_mps,  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+class Driven(NamedTuple):
+    """What came of a drive. gap_m: least gap between the robot and anybody; between: whether it went between two people
+    of a group; state: at the end."""
+
+    gap_m: float
+    between: bool
+    state: EventState
+    seen: list[tuple[float, EventState]]
+
+
+def drive(
+    one: Event, speed_at: Callable[[float], float], start_m: float, seconds: float, left_m: float = 0.0
+) -> Driven:
+    """A robot on a line beside the x axis whose speed (m/s) is a function of the time (s), until it has touched
+    somebody."""
+    states: tuple[EventState, ...] = ()
+    x_m, v_mps, nearest_m, between = start_m, speed_at(0.0), math.inf, False
+    seen = []
+    for tick in range(round(seconds / TICK_S)):
+        query = EventQuery(
+            episode="t", tick=tick, tick_ms=50, robot_x_m=x_m, robot_y_m=left_m, robot_heading_rad=0.0,
+            robot_v_mps=v_mps, robot_w_radps=0.0, route_s_m=x_m, robot_length_m=0.7, robot_width_m=0.55, events=(one,),
+            states=states,
+        )  # fmt: skip
+        states = react(query).states
+        before_m, v_mps = x_m, speed_at(tick * TICK_S)
+        x_m += v_mps * TICK_S
+        seen.append((x_m, states[0]))
+        walkers = states[0].walkers
+        at = np.array([(walker.x_m, walker.y_m) for walker in walkers])
+        gaps = box_disk_gap(np.array([Pose(x_m, left_m, 0.0)]), *HALF_M, at[None])[0] - 0.3
+        nearest_m = min(nearest_m, float(gaps.min()))
+        between |= went_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
+        if nearest_m < 0.0:
+            break
+    return Driven(nearest_m, between, states[0], seen)
+
+
+@pytest.mark.parametrize("v_mps", BLIND_MPS)
+@pytest.mark.parametrize("kind", EVENT_KINDS)
+def test_who_drives_straight_on_at_whatever_speed_meets_somebody_of_every_event(kind: str, v_mps: float) -> None:
+    """On sidewalks of three widths, with few people and many, from either side, slow people and fast: the body is
+    touched after the trigger, or goes between two of a group."""
+    for people in PEOPLE.get(kind, (1,)):
+        for half_m in (1.45, 1.9, 2.9):
+            half_width_m = HALF_WIDTHS_M.get(kind, {}).get(people, half_m)
+            for side, speed_mps in ((1, 1.1), (-1, 1.65)):
+                one = event(kind, half_width_m, people, side, speed_mps)
+                start_m, way_m = (48.0, 18.0) if kind == "overtaking" else (28.0, 36.0)
+                driven = drive(one, lambda _: v_mps, start_m, way_m / v_mps)
+                assert driven.gap_m < 0.0 if (kind, people) != ("conversing", 2) else driven.between
+                assert driven.between or driven.state.phase == "acting"
+
+
+@pytest.mark.parametrize("left_m", [-0.9, -0.5, 0.5, 0.9])
+@pytest.mark.parametrize("kind", STANDING)
+def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(kind: str, left_m: float) -> None:
+    """They step before the robot; who drives near the middle is met on the middle."""
+    for side in (-1, 1):
+        one = event(kind, 1.9, PEOPLE.get(kind, (1,))[0], side)
+        driven = drive(one, lambda _: 0.8, 38.0, 25.0, left_m)
+        assert driven.gap_m < 0.0 or (kind == "conversing" and driven.between)
+    near = drive(event(kind, 1.9, PEOPLE.get(kind, (1,))[0]), lambda _: 0.2, 39.0, 20.0, 0.25)
+    middle = drive(event(kind, 1.9, PEOPLE.get(kind, (1,))[0]), lambda _: 0.2, 39.0, 20.0)
+    assert near.state.walkers[0].y_m == middle.state.walkers[0].y_m
+
+
+@pytest.mark.parametrize("kind", STANDING)
+def test_those_who_stand_stay_until_the_robot_is_three_metres_past_the_last_of_them(kind: str) -> None:
+    """However long it takes: beside them it creeps past at 0.06 m/s, and they do not stir before."""
+    one = event(kind, 2.9, PEOPLE.get(kind, (1,))[0])
+    driven = drive(one, lambda t_s: 1.0 if t_s < 9.0 else 0.06, 38.0, 150.0, left_m=-4.0)
+    last_m = max(walker.x_m for walker in driven.seen[200][1].walkers)
+    over = [x_m for x_m, state in driven.seen if state.phase != "acting" and x_m > 41.0]
+    assert over[0] == pytest.approx(last_m + 3.0, abs=0.01)
+    waiting = drive(one, lambda t_s: 1.0 if t_s < 6.0 else 0.0, 38.0, 120.0)
+    assert waiting.state.phase == "acting"
+
+
+def test_a_stopping_hand_is_let_down_when_the_robot_has_stood_before_it_for_two_seconds() -> None:
+    """Within 3 m; farther away, or after less, it stays."""
+    for stops_at_m, stands_s, obeyed in ((47.5, 2.2, True), (47.5, 1.8, False), (46.5, 9.0, False)):
+        arrives_s = (stops_at_m - 38.0) / 1.0
+        driven = drive(
+            event("gesturing"),
+            lambda t_s, a=arrives_s, s=stands_s: 0.0 if a < t_s < a + s else 0.1 if t_s > a else 1.0,  # type: ignore[misc]
+            38.0,
+            arrives_s + stands_s + 1.0,
+        )
+        assert (driven.state.phase == "over") is obeyed
+
+
+@pytest.mark.parametrize("speed_mps", [1.1, 1.65])
+@pytest.mark.parametrize("left_m", [0.0, 0.4, -0.7])
+def test_who_comes_towards_a_robot_that_stands_walks_round_it(left_m: float, speed_mps: float) -> None:
+    """From wherever it stopped, at least a second before they meet, it is passed at a distance, and the walker goes
+    on."""
+    for drives_s in (0.5, 3.0, 5.0):
+        one = event("frontal", 1.9, speed_mps=speed_mps)
+        driven = drive(one, lambda t_s, d=drives_s: 1.2 if t_s < d else 0.0, 30.0, 40.0, left_m)  # type: ignore[misc]
+        assert driven.gap_m > 0.02
+        assert driven.state.walkers[0].x_m < 30.0
+
+
+def test_a_robot_that_drives_on_is_walked_at_again() -> None:
+    """Standing for a while far away buys nothing."""
+    driven = drive(event("frontal"), lambda t_s: 0.0 if 1.0 < t_s < 5.0 else 1.2, 30.5, 20.0, 0.8)
+    assert driven.gap_m < 0.0
+
+
+@pytest.mark.parametrize("v_mps", [0.3, 0.8, 1.5, 2.5])
+def test_who_overtakes_is_faster_than_the_robot_and_passes_close_by(v_mps: float) -> None:
+    """Up to 3.3 m/s, and within 12 m of a fast robot's way it is before it."""
+    driven = drive(event("overtaking"), lambda _: v_mps, 49.0, 60.0 / v_mps)
+    for (x_m, before), (_, after) in itertools.pairwise(driven.seen):
+        (one,) = after.walkers
+        if after.phase == "acting" and before.phase == "acting" and one.pace_mps is None:
+            assert v_mps < math.hypot(one.vx_mps, one.vy_mps) < 3.3 + 1e-6
+        if abs(one.x_m - x_m) < 0.3 and after.phase == "acting":
+            assert 0.575 < abs(one.y_m) < 1.25
+    slow = [x_m for x_m, state in driven.seen if state.walkers[0].pace_mps is not None]
+    assert slow[0] < 51.0 + 12.0
+
+
+@pytest.mark.parametrize("v_mps", [0.8, 1.5, 2.5])
+def test_who_overtakes_is_not_touched_by_a_robot_that_slows_down_and_walks_on(v_mps: float) -> None:
+    """Nor by one that stands the whole time, which it passes."""
+    cuts_s = next(
+        tick * TICK_S
+        for tick, (_, state) in enumerate(drive(event("overtaking"), lambda _: v_mps, 49.0, 60.0).seen)
+        if state.walkers[0].aim_rad is not None
+    )
+    for stops_s, slow_mps in ((cuts_s + 0.5, 0.1), (2.2 / v_mps, 0.0)):
+        driven = drive(event("overtaking"), lambda t_s, s=stops_s, v=slow_mps: v_mps if t_s < s else v, 49.0, 30.0)  # type: ignore[misc]
+        assert driven.gap_m > 0.05
+        assert driven.state.phase in ("over", "gone")
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize(
+    ("kind", "policy", "succeeds"),
+    [
+        ("obstructing", Crawl(0.8), False),
+        ("obstructing", EdgeDriver(1.2), False),
+        ("overtaking", Crawl(2.5), False),
+        ("frontal", Stander(1.2, 5.0), False),
+        ("overtaking", Orca(), True),
+    ],
+)
+def test_blind_policies_do_not_solve_events_and_who_stands_has_not_failed(
+    kind: str, policy: Crawl | Orca, succeeds: bool
+) -> None:
+    """With real engines and nobody else in the street: the event takes place and is seen; a blind driver collides and
+    is at fault or shares it, and who stands waits for its goal until the time is up."""
+    from cosim.place.walk_graph import WalkGraph
+    from scenarios.builders.reactive import build_reactive
+    from scenarios.execution.places import place
+    from scenarios.execution.run import run_episode
+
+    city = City(seed=5, size_m=500.0)
+    _, street_map = place(city)
+    whole = build_reactive(EVENT_KINDS[kind], city, street_map, WalkGraph(street_map), 1, kind)
+    stands = isinstance(policy, Stander)
+    scenario = msgspec.structs.replace(
+        whole, crowd=CrowdSpec(persons=0, vehicles=0), time_limit_s=25.0 if stands else whole.time_limit_s
+    )
+    record = run_episode(scenario, policy).record
+    assert (record.status, record.measures["success"]) == ("done", float(succeeds))
+    assert record.ended == ("goal" if succeeds else "timeout" if stands else "failure")
+    assert [failure.fault in ("robot_at_fault", "shared") for failure in record.failures] == [True] * (
+        not succeeds and not stands
+    )
