@@ -8,13 +8,15 @@ from types import MappingProxyType
 
 import msgspec
 
-from cosim.core.errors import unknown
+from cosim.core.errors import UsageError, unknown
 from cosim.spec.scenario import Scenario, Suite, read_suite
 from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent / "suites"
 
-SUITES: Mapping[str, Path] = MappingProxyType({name: _HERE / f"{name}.json" for name in ("long-horizon", "reactive")})
+_NAMES = ("unit", "reactive", "long-horizon")
+_FILES = {name: _HERE / f"{name}.json" for name in _NAMES}
+SUITES: Mapping[str, Path] = MappingProxyType({name: path for name, path in _FILES.items() if path.exists()})
 
 
 def load_suite(name: str) -> Suite:
@@ -44,7 +46,7 @@ def holding(scenario_id: str) -> Suite:
 
 
 def with_crowd(whole: Suite, **asked: float | None) -> Suite:
-    """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version says so.
+    """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version and rows say so.
 
     What is None stays as it is. Raises SpecError where a crowd cannot be so.
     """
@@ -52,7 +54,7 @@ def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     if not changes:
         return whole
     replace = msgspec.structs.replace
-    scenarios = tuple(replace(s, crowd=replace(s.crowd, **changes)) for s in whole.scenarios)
+    scenarios = tuple(replace(s, crowd=replace(s.crowd, **changes, added=True)) for s in whole.scenarios)
     version = "-".join([whole.version, *(f"{field}{value:g}" for field, value in changes.items())])
     return replace(whole, scenarios=scenarios, version=version)
 
@@ -67,9 +69,15 @@ def with_robot(whole: Suite, robot: str) -> Suite:
 
 
 def scenarios_chosen(
-    whole: Suite, ids: Sequence[str] = (), episodes: int | None = None, kinds: Sequence[str] = ()
+    whole: Suite,
+    ids: Sequence[str] = (),
+    episodes: int | None = None,
+    kinds: Sequence[str] = (),
+    split: str | None = None,
 ) -> tuple[Scenario, ...]:
     """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.
+
+    split: those of val or of test alone.
 
     Raises UsageError with the valid names.
     """
@@ -84,4 +92,8 @@ def scenarios_chosen(
             raise unknown("event", kind, there)
     if kinds:
         picked = [s for s in picked if any(event.kind in kinds for event in s.events)]
+    if split is not None:
+        picked = [s for s in picked if s.split == split]
+        if not picked:
+            raise UsageError(f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen")
     return tuple(picked[:episodes])

@@ -8,7 +8,7 @@ import sys
 from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, get_args
 
 import typer
 from rich.markup import escape
@@ -17,13 +17,14 @@ from cosim.cli.bench import bench
 from cosim.cli.board import Board
 from cosim.cli.city import city_app
 from cosim.cli.consoles import err, out
-from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, compare_one
+from cosim.cli.crowd import CHILDREN_HELP, CROWD_HELP, ELDERLY_HELP, GROUPS_HELP, VEHICLES_SHARE, compare_one
 from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, ROBOT_HELP, Choice, camera_here, export, film, look
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
 from cosim.cli.progress import doing
-from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError
+from cosim.cli.suite import suite_app
+from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError, unknown
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -79,6 +80,7 @@ def run_command(
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
+    split: Annotated[str | None, typer.Option(help="Run only scenarios of val, or of test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     shared_renderer: Annotated[bool, typer.Option("--shared-renderer", help=SHARED_HELP)] = False,
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
@@ -90,6 +92,7 @@ def run_command(
     roughness: Annotated[
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
+    crowd: Annotated[int | None, typer.Option(min=0, help=CROWD_HELP)] = None,
     residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
     groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
@@ -124,6 +127,7 @@ def run_command(
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
     from cosim.spec.robot import COURIER, robot_called
+    from cosim.spec.scenario import Split
     from scenarios.builders.fits import LOOKING, check_places
     from scenarios.catalog import load_suite, scenarios_chosen, with_crowd, with_robot
     from scenarios.execution.asked import Patience
@@ -146,8 +150,13 @@ def run_command(
     else:
         whole = load_suite(suite)
     whole = with_robot(whole, robot)
-    whole = with_crowd(whole, residents=residents, groups=groups, elderly=elderly, children=children)
-    picked = scenarios_chosen(whole, scenario or (), episodes, event or ())
+    whole = with_crowd(
+        whole, persons=crowd, vehicles=None if crowd is None else round(VEHICLES_SHARE * crowd),
+        residents=residents, groups=groups, elderly=elderly, children=children,
+    )  # fmt: skip
+    if split not in (None, *get_args(Split)):
+        raise unknown("split", str(split), get_args(Split))
+    picked = scenarios_chosen(whole, scenario or (), episodes, event or (), split)
     loaded = load_policy(policy)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
@@ -285,8 +294,6 @@ def show(
         print_by_kind(out, table, kinds_of(folder))
         return
     if episode not in records:
-        from cosim.core.errors import unknown
-
         raise unknown(f"finished episode in {folder}", episode, records)
     from scenarios.viewing.picture import draw_episode
 
@@ -352,6 +359,7 @@ app.command(
     "`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
     "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
 )(bench)
+app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 

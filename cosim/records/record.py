@@ -24,7 +24,7 @@ from cosim.judge.nearness import nearness
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
-from cosim.spec.scenario import Scenario, content_hash
+from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
 NO_RENDERER = "none"
@@ -52,6 +52,7 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
+    split, structure: of the scenario; crowd_added: its crowd is not the suite's own (`CrowdSpec.added`).
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     walked_into: contacts with people who walked into the robot where it stood; no failures.
     waypoints: how those that it answers were followed.
@@ -72,6 +73,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     suite: str
     suite_hash: str
     seed: int
+    split: Split = "val"
+    structure: str = ""
+    crowd_added: bool = False
     robot: str
     policy: str
     policy_version: str
@@ -129,6 +133,9 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source
         suite=scenario.suite,
         suite_hash=suite_hash,
         seed=scenario.seed,
+        split=scenario.split,
+        structure=scenario.structure,
+        crowd_added=scenario.crowd.added,
         robot=scenario.robot,
         policy=manifest.name,
         policy_version=manifest.version,

@@ -15,7 +15,8 @@ from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
 from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
-    "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "robot",
+    "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "split",
+    "structure", "crowd_added", "robot",
     "policy", "policy_version", "waypoints", "goal_protocol", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000

@@ -31,8 +31,8 @@ class EventKind:
     """One kind of event.
 
     name: in scenarios, on the command line, in tables. people: fewest and most. layout: where a reactive scenario has
-    it; None straight over a crosswalk. group(half_width_m, rng) -> how many people a drawn one has; None: any number.
-    on_long_ways: long-horizon scenarios have it too, on sidewalks as wide as its layout says.
+    it, and the room that it needs on a long way; None over a crosswalk. group(half_width_m, rng) -> how many people a
+    drawn one has; None: any number.
 
     trigger_m: it begins when the robot is so far before its place along the route; below 0, when the robot has just
     come so far past it; None, when the robot is on the crosswalk. begin(event, number) -> person `number` before that.
@@ -48,7 +48,6 @@ class EventKind:
     people: tuple[int, int] = (1, 1)
     layout: SidewalkLayout | None
     group: Callable[[float, np.random.Generator], int] | None = None
-    on_long_ways: bool = False
     trigger_m: float | None
     begin: Callable[[Event, int], Walker]
     step: Callable[[Event, EventState, int, EventQuery], Walker]

@@ -127,6 +127,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     (`scenarios.residents`); so many are kept within 60 m of the robot.
     Shares of the persons: groups, of those who walk in groups of two and three; elderly and children, of those who walk
     slower than others. A child walks in a group with an adult, at the child's pace.
+    added: it is another crowd than the suite's own, asked for by who runs it.
     """
 
     persons: Annotated[int, Within(0, MOST_PERSONS)] = DEFAULT_PERSONS
@@ -140,6 +141,7 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     groups: Annotated[float, SHARE] = 0.0
     elderly: Annotated[float, SHARE] = 0.0
     children: Annotated[float, SHARE] = 0.0
+    added: bool = False
 
     @property
     def called(self) -> str:
@@ -182,8 +184,14 @@ class Light(Ranged, frozen=True, kw_only=True):
             yield f"light hdri must be a Radiance .hdr file, not {shown(self.hdri)}"
 
 
+Split = Literal["val", "test"]
+"""val: for choosing and tuning; test: in places that no tuning has seen."""
+
+
 class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     """One episode to run. start: x, y, heading. route: the reference route from start to goal, in metres.
+
+    structure: what it is an example of: straight, curve, crosswalk, a kind of event, static, route; "" if of nothing.
 
     All points are in the net's frame: x east, y north; headings in radians, 0 east, counter-clockwise. Raises SpecError
     where fields contradict each other.
@@ -211,6 +219,8 @@ class Scenario(Ranged, frozen=True, dict=True, kw_only=True):
     ends_on_failure: bool = False
     ends_at: Literal["goal", "stop"] = "goal"
     light: Light = Light()
+    split: Split = "val"
+    structure: Annotated[str, _NAME] = ""
     schema: int = _SCHEMA
 
     @property

@@ -12,12 +12,15 @@ import shapely
 
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
-from cosim.place.street_map import StreetMap
+from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.event_kind import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 
 TRIES: Final = 400
+PERSON_M2: Final = 25.0
+"""Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
+_SAMPLE_M: Final = 20.0
 
 
 class Refusals:
@@ -99,3 +102,22 @@ def people_of(kind: EventKind, half_width_m: float, robot: Robot, rng: np.random
 def wider_m(robot: Robot) -> float:
     """By how much a robot is wider than the one that the layouts of events are written for."""
     return robot.width_m - COURIER.width_m
+
+
+def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
+    """The scenario with no more people than the sidewalks within the crowd's radius of its route have room for."""
+    route = Polyline(np.array(scenario.route))
+    around = [
+        shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
+        for s_m in np.arange(0.0, route.length_m, _SAMPLE_M)
+    ]
+    area_m2 = [
+        sum(
+            strip.polygon.intersection(disc).area
+            for strip in street_map.near("strip", disc)
+            if isinstance(strip, Strip) and strip.kind == "sidewalk"
+        )
+        for disc in around
+    ]
+    persons = min(scenario.crowd.persons, round(float(np.mean(area_m2)) / PERSON_M2))
+    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons))

@@ -14,19 +14,19 @@ from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Polyline
 from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
 from cosim.place.route_line import way_line
-from cosim.place.street_map import Lane, Port, StreetMap, Strip
+from cosim.place.street_map import Lane, Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKinds
-from cosim.spec.events import Event
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Barrier, CrowdSpec, Place, RouteCrossing, Scenario
 from scenarios.builders.barriers import barrier_at, branches, ground_around, prove_single_path
-from scenarios.builders.drawing import TRIES, Refusals, bare_scenario, first_of, people_of, wider_m
+from scenarios.builders.drawing import TRIES, Refusals, bare_scenario, first_of
 from scenarios.builders.hems import hem
 from scenarios.builders.obstacles import with_obstacles
+from scenarios.builders.way_events import draw_events
 from scenarios.events import EVENT_KINDS
 
-_TO_SPARE_M = 0.045
+WAY_SPARE_M = 0.045
 """The way is wider than the robot by this on either side."""
 IN_GROUPS = 0.3
 """Share of the walkers that walk in groups of two and three."""
@@ -35,9 +35,10 @@ ON_ROAD_M = 2.0
 """So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the carriageway."""
 
 CROSSING_EVERY_M = 160.0
-EVENT_EVERY_M = 90.0
-BESIDE_EVENT_M = 0.95
-"""Events take place on sidewalks whose halves are wider than the robot by this: there is room to pass."""
+LENGTH_SLACK_M = 3.0
+"""A way of a wanted length is as long as that, but for this."""
+_END_M = 8.0
+"""A goal keeps this far from the ends of its sidewalk."""
 
 SEARCHES = 150
 """So many ways are searched for where no draw fits."""
@@ -52,9 +53,6 @@ REMEDIES = {
 }
 """What would help, by how the most frequent reason begins."""
 
-EVENT_STRAIGHT_M = 24.0
-EVENT_BEND_M = 0.4
-
 
 class _Draft(NamedTuple):
     """What every draw of a scenario has in common."""
@@ -66,11 +64,12 @@ class _Draft(NamedTuple):
     scenario_id: str
     robot: Robot
     kinds: EventKinds
+    length_m: float | None
 
     @property
     def half_width_m(self) -> float:
         """Half of what the way is wide, at least."""
-        return self.robot.width_m / 2 + _TO_SPARE_M
+        return self.robot.width_m / 2 + WAY_SPARE_M
 
 
 _Fences = Callable[[_Draft, Polyline, Sequence[Port]], tuple[Barrier, ...]]
@@ -84,9 +83,12 @@ def build_long_horizon(
     scenario_id: str,
     robot: Robot = COURIER,
     kinds: EventKinds = EVENT_KINDS,
+    length_m: float | None = None,
 ) -> Scenario:
     """A scenario drawn from `seed`; where no draw has exactly one path to the goal, ways are searched for that can be
-    fenced in all along. Raises SpecError with the reason that stands in the way most often, and what would help."""
+    fenced in all along. length_m: of the way; by default drawn, too.
+
+    Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
     candidates = sorted(
         strip_id
@@ -96,9 +98,12 @@ def build_long_horizon(
     )
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
-    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds)
+    draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds, length_m)
     drawn, searched = Refusals(), Refusals()
-    draws = (lambda: _along(draft, rng, draw_way(street_map, graph, rng, candidates), _barriers) for _ in range(TRIES))
+    draws = (
+        lambda: _along(draft, rng, draw_way(street_map, graph, rng, candidates, length_m), _barriers)
+        for _ in range(TRIES)
+    )
     found = first_of(draws, drawn) or first_of(_search(draft, candidates), searched)
     if found is None:
         reason = searched.most_frequent
@@ -113,7 +118,15 @@ def _along(
 ) -> Scenario:
     """The scenario along a way, as `draw_way` gives it. Raises SpecError when the way does not do."""
     (way, *ends_m), street_map = drawn, draft.street_map
-    route = Polyline(np.round(way_line(street_map, way, *ends_m).points, 3))
+    route = _line(street_map, way, *ends_m)
+    if draft.length_m is not None:
+        # Corners are cut: what that saves is walked on the last sidewalk.
+        ends_m[1] += draft.length_m - route.length_m
+        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
+            raise SpecError("no goal at the wanted distance")
+        route = _line(street_map, way, *ends_m)
+        if abs(route.length_m - draft.length_m) > LENGTH_SLACK_M:
+            raise SpecError("the line is not of the wanted length")
     if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
         raise SpecError("length of the line does not fit")
     crossings = route_crossings(street_map, route, way)
@@ -131,9 +144,14 @@ def _along(
         time_limit_s=max(300.0, route.length_m / 0.2),
         robot=draft.robot,
     )
-    events = draw_events(street_map, route, way, rng, draft.robot, draft.kinds)
-    whole = msgspec.structs.replace(bare, barriers=barriers, events=events, crowd=CrowdSpec(groups=IN_GROUPS))
-    return with_obstacles(whole, street_map)
+    events = draw_events(street_map, route, way, crossings, rng, draft.robot, draft.kinds)
+    parts = {"barriers": barriers, "events": events, "crowd": CrowdSpec(groups=IN_GROUPS), "structure": "route"}
+    return with_obstacles(msgspec.structs.replace(bare, **parts), street_map)
+
+
+def _line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
+    """The route along a way, in whole centimetres."""
+    return Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 2))
 
 
 def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], Scenario]]:
@@ -148,7 +166,7 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
     def draw() -> Scenario:
         if not usable:
             raise SpecError("every long sidewalk is a stair, a bridge, a tunnel or on a road")
-        return _along(draft, rng, search_way(street_map, draft.graph, rng, usable, avoided), _hemmed)
+        return _along(draft, rng, search_way(street_map, draft.graph, rng, usable, avoided, draft.length_m), _hemmed)
 
     return (draw for _ in range(SEARCHES if usable else 1))
 
@@ -177,10 +195,16 @@ def _barriers(draft: _Draft, route: Polyline, way: Sequence[Port]) -> tuple[Barr
 
 
 def draw_way(
-    street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str]
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    candidates: Sequence[str],
+    length_m: float | None = None,
 ) -> tuple[list[Port], float, float]:
-    """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line` takes it."""
-    target_m = rng.uniform(*ROUTE_M)
+    """(way, start_m, goal_m): a shortest way of a drawn length that crosses a street, as `way_line` takes it.
+
+    length_m: the wanted length in place of a drawn one."""
+    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
@@ -199,14 +223,21 @@ def draw_way(
     if crossed < max(1, round(target_m / CROSSING_EVERY_M)):
         raise SpecError("the way crosses too few streets")
     goal_strip = street_map.strips[goal.strip]
+    if length_m is not None:
+        return way, start_m, length_m - start_m - reach.to(goal)
     return way, start_m, float(rng.uniform(0.4, 0.7)) * goal_strip.length_m
 
 
 def search_way(
-    street_map: StreetMap, graph: WalkGraph, rng: np.random.Generator, candidates: Sequence[str], avoided: Set[str]
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    candidates: Sequence[str],
+    avoided: Set[str],
+    length_m: float | None = None,
 ) -> tuple[list[Port], float, float]:
     """As `draw_way`, but over none of the `avoided` strips, and to any goal within reach that does."""
-    target_m = rng.uniform(*ROUTE_M)
+    target_m = rng.uniform(*ROUTE_M) if length_m is None else length_m
     strip = street_map.strips[candidates[int(rng.integers(len(candidates)))]]
     leave = Port(strip.id, 1 if rng.random() < 0.5 else 0)
     start_m = float(rng.uniform(0.4, 0.7)) * strip.length_m
@@ -220,6 +251,8 @@ def search_way(
             continue
         crossed = sum(street_map.strips[port.strip].kind == "crossing" for port in way) // 2
         if crossed >= max(1, round(target_m / CROSSING_EVERY_M)):
+            if length_m is not None:
+                return way, start_m, length_m - start_m - reach.to(goals[i])
             return way, start_m, float(rng.uniform(0.4, 0.7)) * street_map.strips[goals[i].strip].length_m
     raise SpecError("no way of the drawn length crosses a street every 160 m")
 
@@ -248,61 +281,3 @@ def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteC
         if lane.kind == "road" and not lane.internal:
             on_road |= shapely.contains_xy(lane.polygon, x, y)
     return float(on_road.sum())
-
-
-def draw_events(
-    street_map: StreetMap,
-    route: Polyline,
-    way: Sequence[Port],
-    rng: np.random.Generator,
-    robot: Robot,
-    kinds: EventKinds,
-) -> tuple[Event, ...]:
-    """Events about every EVENT_EVERY_M metres, on straight pieces of sidewalk wide enough for event and robot."""
-    layouts = {kind.name: kind.layout for kind in kinds.values() if kind.on_long_ways and kind.layout is not None}
-    if not layouts:
-        return ()
-    places, wide_m = [], 2.0 * (robot.width_m + BESIDE_EVENT_M)
-    for s_m in np.arange(35.0, route.length_m - 25.0, 5.0):
-        strip = _sidewalk_at(street_map, way, route, float(s_m))
-        if strip is not None and strip.width_m >= wide_m and _is_straight(route, float(s_m)):
-            places.append((float(s_m), strip.width_m / 2))
-    events: list[Event] = []
-    next_s_m = 0.0
-    names = rng.permutation([*layouts]).tolist()
-    for s_m, half_width_m in places:
-        name = names[len(events) % len(names)]
-        if s_m < next_s_m or half_width_m < layouts[name].half_width_m + wider_m(robot):
-            continue
-        pose = route.at(s_m)
-        events.append(
-            Event(
-                id=f"e{len(events)}",
-                kind=name,
-                x_m=pose.x_m,
-                y_m=pose.y_m,
-                heading_rad=pose.heading_rad,
-                route_s_m=s_m,
-                half_width_m=half_width_m,
-                people=people_of(kinds[name], half_width_m, robot, rng),
-                speed_mps=float(rng.uniform(1.1, 1.65)),
-                side=1 if rng.random() < 0.5 else -1,
-            )
-        )
-        next_s_m = s_m + float(rng.uniform(0.6, 1.4)) * EVENT_EVERY_M
-    return tuple(events)
-
-
-def _sidewalk_at(street_map: StreetMap, way: Sequence[Port], route: Polyline, s_m: float) -> Strip | None:
-    """The sidewalk of the way at an arc length of the route, None on corners and crossings."""
-    pose = route.at(s_m)
-    strip = street_map.strips.get(street_map.locate(pose.x_m, pose.y_m, 0.05).edge)
-    return strip if strip is not None and strip.kind == "sidewalk" and strip.id in {p.strip for p in way} else None
-
-
-def _is_straight(route: Polyline, s_m: float) -> bool:
-    """Whether the route bends by less than EVENT_BEND_M in the stretch before and a little behind a place."""
-    from_m, to_m = s_m - EVENT_STRAIGHT_M, s_m + 5.0
-    chord = Polyline([route.at(from_m).xy, route.at(to_m).xy])
-    between = route.points[(route.s_m > from_m) & (route.s_m < to_m)]
-    return all(abs(chord.project(x, y)[1]) < EVENT_BEND_M for x, y in between)

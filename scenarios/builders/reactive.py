@@ -1,4 +1,4 @@
-"""Builder of reactive scenarios: 10 to 20 m of way, one event on it, street life around; ends on the first failure."""
+"""Builder of reactive scenarios: 10 to 20 m of way, one event on it, nobody else; ends on the first failure."""
 
 from __future__ import annotations
 
@@ -23,8 +23,9 @@ from scenarios.builders.drawing import bare_scenario, first_that_fits, people_of
 from scenarios.builders.long_horizon import route_crossings
 from scenarios.builders.obstacles import with_obstacles
 
-_LIMIT_S = 60.0
-CROWD = CrowdSpec(persons=12, radius_m=80.0, vehicles=8)
+LIMIT_S = 60.0
+NO_CROWD = CrowdSpec(persons=0, vehicles=0)
+"""Nobody but the people of the event, as in the paper, and no vehicles."""
 BESIDE_CROSSING_M = (2.0, 5.0)
 """Way driven before a crosswalk and after it, least and most."""
 _ROOM_M = 0.35
@@ -37,7 +38,7 @@ _SPEEDS_MPS = (1.1, 1.65)
 """Walking speeds of the paper."""
 
 
-class _EventSpot(NamedTuple):
+class EventSpot(NamedTuple):
     """A way and where the event is on it. route: (N, 2) m; half_width_m, half_length_m: see `Event`."""
 
     route: Floats
@@ -68,9 +69,9 @@ def build_reactive(
     def draw() -> Scenario:
         strip, layout = strips[int(rng.integers(len(strips)))], kind.layout
         at = (
-            _over_crossing(street_map, strip, rng, robot)
+            over_crossing(street_map, strip, rng, robot)
             if layout is None
-            else _along_sidewalk(layout, strip, rng, robot)
+            else along_sidewalk(layout, strip, rng, robot)
         )
         bare = bare_scenario(
             Polyline(at.route),
@@ -80,17 +81,18 @@ def build_reactive(
             suite="reactive",
             seed=seed,
             scenario_id=scenario_id,
-            time_limit_s=_LIMIT_S,
+            time_limit_s=LIMIT_S,
             robot=robot,
         )
         event = _event_at(kind, at, rng, robot)
-        whole = msgspec.structs.replace(bare, events=(event,), crowd=CROWD, ends_on_failure=True, ends_at=kind.ends_at)
+        of_kind = {"events": (event,), "structure": kind.name, "ends_at": kind.ends_at}
+        whole = msgspec.structs.replace(bare, crowd=NO_CROWD, ends_on_failure=True, **of_kind)
         return with_obstacles(whole, street_map, beside=True)
 
     return first_that_fits(draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}")
 
 
-def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: Robot) -> Event:
+def _event_at(kind: EventKind, at: EventSpot, rng: np.random.Generator, robot: Robot) -> Event:
     return Event(
         id="e0",
         kind=kind.name,
@@ -106,7 +108,7 @@ def _event_at(kind: EventKind, at: _EventSpot, rng: np.random.Generator, robot: 
     )
 
 
-def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
+def along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator, robot: Robot) -> EventSpot:
     half_m = strip.width_m / 2
     if half_m < layout.half_width_m + wider_m(robot):
         raise SpecError("sidewalk too narrow")
@@ -125,10 +127,10 @@ def _along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generat
         raise SpecError("sidewalk not straight")
     steps = np.append(np.arange(0.0, way_m - 0.5, 1.0), way_m)
     route = np.round([chord.at(float(s)).xy for s in steps], 3)
-    return _EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
+    return EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
 
 
-def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot) -> _EventSpot:
+def over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot) -> EventSpot:
     leave: Literal[0, 1] = 1 if rng.random() < 0.5 else 0
     if not 5.0 <= strip.length_m <= 12.0 or None in strip.corners:
         raise SpecError("crossing too short or too long")
@@ -141,7 +143,7 @@ def _over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator
     enter_m, leave_m = crossings[0].enter_s_m, crossings[0].leave_s_m
     middle_m, (along_x, along_y) = 0.5 * (enter_m + leave_m), ends[1] - ends[0]
     pose = route.at(middle_m)._replace(heading_rad=math.atan2(along_y, along_x))
-    return _EventSpot(route.points, pose, middle_m, strip.width_m / 2, 0.5 * (leave_m - enter_m), crossings)
+    return EventSpot(route.points, pose, middle_m, strip.width_m / 2, 0.5 * (leave_m - enter_m), crossings)
 
 
 def _straight_over(street_map: StreetMap, ends: Floats, room_m: float) -> Floats:

@@ -6,27 +6,19 @@ import itertools
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import msgspec
-import numpy as np
-import shapely
-
 from cosim.core.errors import MapError, SpecError, unknown
-from cosim.core.geometry import Polyline
-from cosim.place.street_map import StreetMap, Strip
+from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKind, EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.builders import long_horizon, reactive
+from scenarios.builders.drawing import thinned
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.maps.place_names import place_called
 
 _KINDS = ("long-horizon", "reactive")
-PERSON_M2 = 25.0
-"""Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
-
-_SAMPLE_M = 20.0
 
 
 def suite_on_map(
@@ -110,22 +102,3 @@ class _Drawn(NamedTuple):
     def _one(self, kind: EventKind, seed: int) -> Scenario:
         scenario_id = f"{kind.name}-{self.name}-{seed:03d}"
         return reactive.build_reactive(kind, self.where, self.street_map, self.graph, seed, scenario_id, self.robot)
-
-
-def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
-    """The scenario with no more people than the sidewalks within the crowd's radius of its route have room for."""
-    route = Polyline(np.array(scenario.route))
-    around = [
-        shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
-        for s_m in np.arange(0.0, route.length_m, _SAMPLE_M)
-    ]
-    area_m2 = [
-        sum(
-            strip.polygon.intersection(disc).area
-            for strip in street_map.near("strip", disc)
-            if isinstance(strip, Strip) and strip.kind == "sidewalk"
-        )
-        for disc in around
-    ]
-    persons = min(scenario.crowd.persons, round(float(np.mean(area_m2)) / PERSON_M2))
-    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons))

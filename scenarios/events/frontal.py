@@ -44,7 +44,6 @@ def _ends(event: Event, state: EventState, query: EventQuery) -> bool:
 FRONTAL: Final = EventKind(
     name="frontal",
     layout=SidewalkLayout((18.0, 20.0), (21.0, 22.0)),
-    on_long_ways=True,
     trigger_m=20.0,
     begin=_begin,
     step=_step,

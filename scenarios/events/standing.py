@@ -162,7 +162,6 @@ def _queue(half_width_m: float, rng: np.random.Generator) -> int:
 OBSTRUCTING: Final = EventKind(
     name="obstructing",
     layout=_PASSABLE,
-    on_long_ways=True,
     trigger_m=_TRIGGER_M,
     begin=_begin,
     step=_standing(in_the_way, _about),

@@ -19,9 +19,10 @@ from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
-from sumo_nets.maps.importer import Options, convert
+from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
 from sumo_nets.maps.rawfile import head_of
 from sumo_nets.maps.scratch import move_in, moving, scratch_in
+from sumo_nets.maps.wheel_places import WHEEL_PLACES
 from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netfacts import read_facts
 from sumo_nets.net.snapshot import street_map_of
@@ -74,7 +75,7 @@ def import_map(source: Path, name: str | None = None, options: Options | None = 
     name = map_name(source) if name is None else name
     if not NAMES.fullmatch(name):
         raise UsageError(f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters")
-    if name in _game_nets() and source != _game_nets()[name]:
+    if name in _supplied() and source != _supplied()[name]:
         raise UsageError(f"'{name}' is the name of a net that comes with SUMO: choose another with --name")
     return _keep(source, name, Options() if options is None else options)
 
@@ -97,10 +98,10 @@ def map_net(place: CityMap | str) -> Path:
     name = place if isinstance(place, str) else place.map
     path = maps_folder() / name / "net.xml"
     if not NAMES.fullmatch(name) or not _is_there(path):
-        games = _game_nets()
-        if name not in games:
+        supplied = _supplied()
+        if name not in supplied:
             raise unknown("map", name, known_maps())
-        _keep(games[name], name, Options(), in_place=False)
+        _keep(supplied[name], name, _options_of(name), in_place=False)
     if not isinstance(place, str) and place.net_hash and (found := map_hash(path)) != place.net_hash:
         raise MapError(
             f"map '{name}': its hash is {found}, but the scenario was made on {place.net_hash}: import the same "
@@ -157,12 +158,12 @@ def checked_map(name: str) -> tuple[StreetMap, MapCheck, About]:
 
 
 def known_maps() -> dict[str, Known]:
-    """Every place by name: imported ones, then nets with sidewalks that come with SUMO."""
+    """Every place by name: imported ones, then nets with sidewalks that come with SUMO, whole and as crops."""
     folder = maps_folder()
     found = sorted(p.parent for p in folder.glob(f"*/{ABOUT}")) if folder.is_dir() else []
-    games = _game_nets()
-    known = {p.name: Known(p.name, "imported", _source_of(p.name)) for p in found if p.name not in games}
-    return known | {name: Known(name, "sumo", path.name) for name, path in games.items()}
+    supplied = _supplied()
+    known = {p.name: Known(p.name, "imported", _source_of(p.name)) for p in found if p.name not in supplied}
+    return known | {name: Known(name, "sumo", path.name) for name, path in supplied.items()}
 
 
 def _source_of(name: str) -> str:
@@ -195,7 +196,7 @@ def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -
                 versions={"importer": str(IMPORTER), "eclipse-sumo": version("eclipse-sumo")},
                 changes=made.changes,
                 guessed_share=made.guessed_share,
-                licences=_licences(source, made.licences),
+                licences=_licences(name, source, made.licences),
                 net_hash=map_hash(ready / "net.xml"),
             )
             (ready / ABOUT).write_bytes(msgspec.json.format(msgspec.json.encode(about), indent=2))
@@ -205,11 +206,13 @@ def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -
         raise unwritable(folder, error, "set COSIM_CACHE to another folder") from error
 
 
-def _licences(source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
+def _licences(name: str, source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
     """What the file itself and the texts beside it say about its licence."""
     said = list(found)
-    if source in _game_nets().values():
+    if source in _supplied().values():
         said.append(GAME_LICENCE)
+    if name in WHEEL_PLACES and WHEEL_PLACES[name].osm:
+        said.append(OSM_LICENCE)
     for name in ("LICENCE.txt", "LICENSE.txt", "LICENSE", "SOURCE.txt"):
         try:
             text = (source.resolve().parent / name).read_text(errors="replace")
@@ -220,6 +223,17 @@ def _licences(source: Path, found: tuple[str, ...]) -> tuple[str, ...]:
             lines = [line for line in lines if line.startswith("Origin")]
         said.append(f"{name}: {' '.join(lines)[:1000]}")
     return tuple(said)
+
+
+def _supplied() -> dict[str, Path]:
+    """The nets that come with the SUMO package, by the names of the places they make."""
+    return _game_nets() | {name: one.path for name, one in WHEEL_PLACES.items()}
+
+
+def _options_of(name: str) -> Options:
+    """How a place that comes with SUMO is imported."""
+    one = WHEEL_PLACES.get(name)
+    return Options() if one is None else Options(bbox=one.box, upgrade=one.upgrade)
 
 
 @cache

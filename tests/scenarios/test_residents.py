@@ -327,7 +327,7 @@ def test_a_crowd_without_residents_is_what_it_was() -> None:
     settled = with_crowd(shipped, residents=8)
     assert settled.version != shipped.version and settled.content_hash != shipped.content_hash
     one = msgspec.json.decode(msgspec.json.encode(settled.scenarios[0]), type=Scenario)
-    assert one.crowd == msgspec.structs.replace(shipped.scenarios[0].crowd, residents=8)
+    assert one.crowd == msgspec.structs.replace(shipped.scenarios[0].crowd, residents=8, added=True)
     assert one == settled.scenarios[0]
     with pytest.raises(SpecError, match=r"crowd residents must be in \[0, 60\], not 61"):
         CrowdSpec(residents=61)

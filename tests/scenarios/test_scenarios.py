@@ -26,9 +26,10 @@ from cosim.spec.events import Event, EventQuery
 from cosim.spec.robot import ROBOTS, Robot
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
-from scenarios.builders.build import Proof
+from scenarios.builders.drawing import thinned
 from scenarios.builders.long_horizon import build_long_horizon, on_road_m
-from scenarios.builders.sample import suite_on_map, thinned
+from scenarios.builders.proofs import read_proofs
+from scenarios.builders.sample import suite_on_map
 from scenarios.catalog import SUITES, load_suite, scenarios_chosen
 from scenarios.events import EVENT_KINDS, react
 from sumo_nets.maps.mapstore import read_map
@@ -76,8 +77,7 @@ def first_query(scenario: Scenario) -> EventQuery:
 @pytest.mark.parametrize("name", SUITES)
 def test_every_scenario_comes_with_its_proof(name: str) -> None:
     """The proofs beside a suite are of these very scenarios."""
-    proofs = msgspec.json.decode(SUITES[name].with_suffix(".proof.json").read_bytes(), type=list[Proof])
-    assert {proof.scenario: proof.scenario_hash for proof in proofs} == {
+    assert {proof.scenario: proof.scenario_hash for proof in read_proofs(SUITES[name]).proofs} == {
         s.id: content_hash(s) for s in load_suite(name).scenarios
     }
 
