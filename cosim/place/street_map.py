@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import shapely
@@ -157,6 +157,17 @@ class StreetMap:
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )
+    _made_of: str = field(default="", init=False, repr=False, compare=False)
+
+    @property
+    def made_of(self) -> str:
+        """A hash of all that it was read from, and of what read it; "" where it is made by hand or of another one."""
+        return self._made_of
+
+    def read_of(self, made_of: str) -> Self:
+        """This map, told its `made_of` by who read it."""
+        object.__setattr__(self, "_made_of", made_of)
+        return self
 
     @cached_property
     def too_steep(self) -> frozenset[Port]:

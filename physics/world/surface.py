@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cosim.core.baked import Arrays
 from cosim.core.geometry import Floats, Pose
 from physics.street.buildings import Building
 from physics.street.furniture import Prop
@@ -82,6 +84,10 @@ class Surface(ABC):
     def finish(self, key: Key) -> Finish:
         """What cameras with textures add to the chunk of a square."""
         return Finish()
+
+    def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
+        """What `make` makes of a square, or what it has made of it before; kind: its name."""
+        return make()
 
     def land(self, xy: ArrayLike) -> Floats:
         """The lie of the land at (N, 2) points, (N,) metres, steps such as curbs left out."""
