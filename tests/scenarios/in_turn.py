@@ -31,6 +31,7 @@ _CROWDS = (
     CrowdSpec(persons=30, vehicles=20, groups=0.5, elderly=0.2, children=0.2, radius_m=60.0),
     CrowdSpec(density=8.0, vehicles=0, radius_m=50.0),
     CrowdSpec(persons=5, vehicles=4, residents=4),
+    CrowdSpec(persons=0, vehicles=0),
 )
 _DRIVES = Command(1.0, 0.2)
 
@@ -38,7 +39,7 @@ _DRIVES = Command(1.0, 0.2)
 def drawn() -> Iterator[tuple[Scenario, Manifest]]:
     """Scenarios that are unlike their neighbours in all that is kept from episode to episode, and who drives.
 
-    They come in fours of one crowd and in pairs of one seed, which sets SUMO's clock to the same time: what an
+    They come in sixes of one crowd and in pairs of one seed, which sets SUMO's clock to the same time: what an
     episode leaves behind would be found by the next one.
     """
     for k in range(COUNT):
@@ -57,7 +58,7 @@ def drawn() -> Iterator[tuple[Scenario, Manifest]]:
                 start=(start.x_m, start.y_m, start.heading_rad),
                 goal=route[-1],
                 route=route,
-                crowd=_CROWDS[k // 4 % 4],
+                crowd=_CROWDS[k // 6],
                 robot=list(ROBOTS)[k % 5 % len(ROBOTS)],
                 light=Light(hour=20.5) if k % 7 == 3 else Light(),
             ),
@@ -95,6 +96,7 @@ def _as_the_first(work: Callable[[], str]) -> str:
 
 if __name__ == "__main__":
     import scenarios.residents.director  # noqa: F401  as the engines
+    import sumo_nets.crowd.crowd  # noqa: F401
 
     sample = "--sample" in sys.argv
     episodes = [one for k, one in enumerate(drawn()) if k % 6 < 2 or not sample]
