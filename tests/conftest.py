@@ -32,17 +32,27 @@ settings.register_profile(
 settings.load_profile("tests")
 
 
+COLLECTED = pytest.StashKey[list[str]]()
+"""The ids of all tests of a session, those that it leaves out included."""
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    config.stash[COLLECTED] = [item.nodeid for item in items]
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--whole", action="store_true", help="all damaged files and shipped routes, where a sample is tested by default"
-    )
+    parser.addoption("--whole", action="store_true", help="all where a sample is tested by default")
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Nets are kept between runs, for all processes, beside no user's: a folder for each state of what makes them.
 
-    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it ignored.
+    Ctrl-C is heard, here and in what the tests start, also where a shell in the background has it ignored. Modules are
+    compiled once, not in each of hundreds of processes, also where that is turned off.
     """
+    sys.dont_write_bytecode = False
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     made_by = hashlib.sha256(f"{version('eclipse-sumo')} {version('numpy')}".encode())
     for source in sorted((ROOT / "sumo_nets").rglob("*.py")):
@@ -66,7 +76,7 @@ Cosim = Callable[..., Said]
 """cosim(*words, cwd=folder)."""
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def cosim() -> Cosim:
     """The command line by its own entry point, in this process: nothing is loaded anew, the rest is as for a user."""
     return _here

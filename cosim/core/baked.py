@@ -27,10 +27,15 @@ from platformdirs import user_cache_path
 Arrays = Mapping[str, NDArray[Any]]
 
 _FOLDER: Final = "baked"
+MAKING: Final = ".making-"
+"""How the names of what is half made begin."""
 _SEAL: Final = "seal.json"
 _LEFT_OVER_S: Final = 3600.0
-"""A folder in the making that is older than this belongs to a process that was killed."""
-_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy")
+"""What is in the making for longer than this belongs to a process that was killed."""
+_UNUSED_S: Final = 30 * 86400.0
+_MOST_BYTES: Final = 1 << 30
+"""What was not used for longer than this, or not last among so much, is taken away."""
+_MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
 """Packages that what is baked depends on."""
 
 
@@ -77,14 +82,15 @@ def _read(folder: Path) -> Arrays:
             if hashlib.file_digest(file, "sha256").hexdigest() != seal:
                 raise ValueError(f"{folder / key}.npy: not what was written")
         arrays[key] = np.load(folder / f"{key}.npy", mmap_mode="r", allow_pickle=False)
+    mark_used(folder)
     return arrays
 
 
 def _keep(folder: Path, arrays: Arrays) -> None:
     """In one move: several processes may make the same at once, and the first wins."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    _clear(folder.parent)
-    making = Path(tempfile.mkdtemp(prefix=".making-", dir=folder.parent))
+    forget_unused(folder)
+    making = Path(tempfile.mkdtemp(prefix=MAKING, dir=folder.parent))
     try:
         seals = {}
         for key, array in arrays.items():
@@ -105,12 +111,32 @@ def _keep(folder: Path, arrays: Arrays) -> None:
         shutil.rmtree(making, ignore_errors=True)
 
 
-def _clear(parent: Path) -> None:
-    """Take away what processes that were killed left half made."""
-    for left in parent.glob(".making-*"):
+def mark_used(folder: Path) -> None:
+    """Keep a folder of kept files from being forgotten, where that may be written."""
+    with suppress(OSError):
+        os.utime(folder)
+
+
+def forget_unused(mine: Path) -> None:
+    """Take away the neighbours of a folder that nobody has used for long, those used last being kept as far as there
+    is room, and what processes that were killed left half made."""
+    found = [(_when(path), path) for path in mine.parent.iterdir() if path != mine]
+    held = 0
+    for when_s, path in sorted(found, reverse=True):
         with suppress(OSError):
-            if time.time() - left.stat().st_mtime > _LEFT_OVER_S:
-                shutil.rmtree(left, ignore_errors=True)
+            held += sum(file.stat().st_size for file in os.scandir(path))
+        kept_s = _LEFT_OVER_S if path.name.startswith(MAKING) else _UNUSED_S
+        if time.time() - when_s > kept_s or held > _MOST_BYTES:
+            shutil.rmtree(path, ignore_errors=True)
+            with suppress(OSError):
+                path.unlink()
+
+
+def _when(path: Path) -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:  # somebody else has just taken it away
+        return 0.0
 
 
 def say_not_kept(folder: Path, error: Exception) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, Self
 
 import numpy as np
 import shapely
@@ -38,6 +38,19 @@ class Port(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class SignalPlan:
+    """A crossing's signal that goes by the clock alone: phase after phase, and again from the first.
+
+    The first one begins at offset_ms, in milliseconds of SUMO's time. durations_ms: of the phases; walks: whether one
+    may walk in each.
+    """
+
+    offset_ms: int
+    durations_ms: tuple[int, ...]
+    walks: tuple[bool, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Strip:
     """A sidewalk or a crossing: a band of `width_m` around `line`, (N, 2) metres.
 
@@ -45,7 +58,8 @@ class Strip:
     (ids of the road edges crossed) are for crossings; frontage_m, curb_m (width of curb and gutter), verge_m and
     street_class for sidewalks. road_side: +1 when the road lies left of `line`, -1 right, 0 when there is none.
     driveways: arc lengths of `line`, in metres, where a driveway's middle crosses the sidewalk. going: plain ground,
-    steps, or a bridge or tunnel, which share their place on the map with what lies below or above.
+    steps, or a bridge or tunnel, which share their place on the map with what lies below or above. plan: of a
+    crossing's signal; None where there is no signal, or where SUMO alone can tell what it shows.
     """
 
     id: str
@@ -63,6 +77,7 @@ class Strip:
     road_side: int = 1
     driveways: tuple[float, ...] = ()
     going: Literal["plain", "steps", "bridge"] = "plain"
+    plan: SignalPlan | None = None
 
     @property
     def length_m(self) -> float:
@@ -157,6 +172,22 @@ class StreetMap:
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )
+    _made_of: str = field(default="", init=False, repr=False, compare=False)
+
+    @property
+    def made_of(self) -> str:
+        """A hash of all that it was read from, and of what read it; "" where it is made by hand or of another one."""
+        return self._made_of
+
+    def read_of(self, made_of: str) -> Self:
+        """This map, told its `made_of` by who read it."""
+        object.__setattr__(self, "_made_of", made_of)
+        return self
+
+    @cached_property
+    def signals_by_the_clock(self) -> bool:
+        """Whether all signals of crossings have a plan."""
+        return all(strip.plan is not None for strip in self.strips.values() if strip.signalised)
 
     @cached_property
     def too_steep(self) -> frozenset[Port]:

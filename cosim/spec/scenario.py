@@ -147,6 +147,11 @@ class CrowdSpec(Ranged, frozen=True, kw_only=True):
     def called(self) -> str:
         return "crowd "
 
+    @property
+    def empty(self) -> bool:
+        """Whether there are neither persons nor vehicles to come and go; residents do not count."""
+        return not self.vehicles and not (self.persons if self.density is None else self.density)
+
     def contradictions(self) -> Iterator[str]:
         if 2.0 * self.children > self.groups + 1e-9:
             yield (

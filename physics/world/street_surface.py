@@ -1,14 +1,17 @@
-"""A street map as a surface: tiles, buildings and props by key, heights by point; built when first needed."""
+"""A street map as a surface: tiles, buildings and props by key, heights by point; made when first needed on a machine,
+and kept for all its processes."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Callable
 from typing import Final
 
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
 
+from cosim.core.baked import Arrays
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.place.street_map import StreetMap
@@ -21,6 +24,14 @@ from physics.street.paint import paint_in
 from physics.street.placement import Placement
 from physics.street.props import SignalPost, posts_in
 from physics.textures.ground import layer_of
+from physics.world.kept_tiles import (
+    TileThings,
+    pieces_of,
+    things_as_arrays,
+    things_of_arrays,
+    tile_as_arrays,
+    tile_of_arrays,
+)
 from physics.world.materials import PAVINGS, PLAIN_FRICTION, Paving, friction
 from physics.world.surface import Chunk, Finish, Patch, Surface
 from physics.world.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
@@ -45,7 +56,9 @@ class StreetSurface(Surface):
         self._frontage = Frontage(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage, mapped)
+        self._pieces = pieces_of(street_map, seed, roughness)
         self._tiles: OrderedDict[Key, Tile] = OrderedDict()
+        self._things: dict[Key, TileThings] = {}
 
     def chunk(self, key: Key) -> Chunk:
         ground = [
@@ -65,26 +78,28 @@ class StreetSurface(Surface):
         for layer, mesh in paint_in(self.street_map, tile).items():
             label = "road" if layer == "paint" else "sidewalk"
             painted.append(Patch(f"{label}:{layer}", mesh, PLAIN_FRICTION, label, (1.0, 1.0, 1.0), layer, False))
-        styles = [style_of(building, self.street_map) for building in self._frontage.in_tile(key)]
+        styles = [style_of(building, self.street_map) for building in self.buildings(key)]
         return Finish(tuple(laid), tuple(painted), tuple(styles))
 
     def tile(self, key: Key) -> Tile:
         if key not in self._tiles:
-            roots = self._trees(key) if self.roughness > 0.0 else []
-            self._tiles[key] = build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
+            held = self.kept("ground", key, lambda: tile_as_arrays(self._built(key)))
+            self._tiles[key] = tile_of_arrays(held, key, self.street_map.terrain)
             if len(self._tiles) > _KEPT:
                 self._tiles.popitem(last=False)
         self._tiles.move_to_end(key)
         return self._tiles[key]
 
+    def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
+        return self._pieces.get(f"{kind}_{key[0]}_{key[1]}", make)
+
     def buildings(self, key: Key) -> tuple[Building, ...]:
         """Buildings whose centre lies in the tile, on their land."""
-        buildings, terrain = self._frontage.in_tile(key), self.street_map.terrain
-        return buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+        return self._standing_in(key).buildings
 
     def props(self, key: Key) -> tuple[tuple[Prop, float], ...]:
         """Props whose middle lies in the tile, each with the height of its foot in metres."""
-        props = self._placement.in_tile(key)
+        props = self._standing_in(key).props
         heights = self.tile(key).height([(prop.x_m, prop.y_m) for prop in props])
         if props and not self.level:
             sizes = np.array([prop.size_m[:2] for prop in props])
@@ -97,12 +112,27 @@ class StreetSurface(Surface):
 
     def standing(self, area: shapely.Geometry) -> list[Prop]:
         """Props in the tiles that an area touches."""
-        return [prop for key in keys_in(area) for prop in self._placement.in_tile(key)]
+        return [prop for key in keys_in(area) for prop in self._standing_in(key).props]
+
+    def _standing_in(self, key: Key) -> TileThings:
+        if key not in self._things:
+            held = self.kept("things", key, lambda: things_as_arrays(self._placed(key)))
+            self._things[key] = things_of_arrays(held)
+        return self._things[key]
+
+    def _placed(self, key: Key) -> TileThings:
+        buildings, terrain = self._frontage.in_tile(key), self.street_map.terrain
+        on_their_land = buildings if terrain is None else tuple(on_land(b, terrain) for b in buildings)
+        return TileThings(on_their_land, self._placement.in_tile(key))
+
+    def _built(self, key: Key) -> Tile:
+        roots = self._trees(key) if self.roughness > 0.0 else []
+        return build_tile(self.street_map, key, self._paving, self.roughness, self.seed, roots)
 
     def _trees(self, key: Key) -> list[tuple[float, float]]:
         """Where trees stand in a tile and around it."""
         around = [(key[0] + i, key[1] + j) for i in (-1, 0, 1) for j in (-1, 0, 1)]
-        props = [prop for near in around for prop in self._placement.in_tile(near) if prop.kind == "tree"]
+        props = [prop for near in around for prop in self._standing_in(near).props if prop.kind == "tree"]
         return [(prop.x_m, prop.y_m) for prop in props]
 
     def heights(self, xy: ArrayLike) -> Floats:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from cosim.core.baked import Arrays
 from cosim.core.geometry import Floats, Pose
 from cosim.spec.obstacle import Obstacle
 from physics.street.buildings import Building
@@ -84,6 +85,10 @@ class Surface(ABC):
     def finish(self, key: Key) -> Finish:
         """What cameras with textures add to the chunk of a square."""
         return Finish()
+
+    def kept(self, kind: str, key: Key, make: Callable[[], Arrays]) -> Arrays:
+        """What `make` makes of a square, or what it has made of it before; kind: its name."""
+        return make()
 
     def land(self, xy: ArrayLike) -> Floats:
         """The lie of the land at (N, 2) points, (N,) metres, steps such as curbs left out."""

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
@@ -34,8 +35,11 @@ from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place, surface_of_place
 from scenarios.execution.scorer import Scorer
 from scenarios.rendering.link import SharedCamera
-from sumo_nets.crowd.crowd import SumoCrowd
 from sumo_nets.crowd.demand_log import Entrances
+from sumo_nets.crowd.empty_street import EmptyStreet, goes_by_itself
+
+if TYPE_CHECKING:
+    from sumo_nets.crowd.crowd import SumoCrowd
 
 CORRIDOR_M = 40.0
 """The walkable area is judged this far around the route; beyond it everything is out of lane."""
@@ -79,7 +83,8 @@ def staged(
         street = surface_of_place(scenario.place)
         robot = robot_called(scenario.robot)
         world = stack.enter_context(world_of(street, scenario.barriers, robot, scenario.obstacles))
-        crowd = stack.enter_context(crowd_of(scenario))
+        crowd = crowd_of(scenario)
+        stack.enter_context(crowd)
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
             return camera_of(camera_of_choice(options.camera), world, spec, light=scenario.light)
@@ -126,11 +131,15 @@ def world_of(
     return BulletWorld(surface, barriers, robot, obstacles)
 
 
-def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd:
+def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd | EmptyStreet:
     """The street life of a scenario, not running yet. before: who comes and goes, in place of who would be drawn."""
     net_path, street_map = place(scenario.place)
-    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     robot, start_xy = robot_called(scenario.robot), scenario.start[:2]
+    if goes_by_itself(street_map, scenario.crowd, before):
+        return EmptyStreet(street_map, scenario.seed, start_xy)
+    from sumo_nets.crowd.crowd import SumoCrowd  # with SUMO
+
+    closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     return SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, robot.footprint_m, before)
 
 

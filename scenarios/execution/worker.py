@@ -112,7 +112,7 @@ def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, b
     name = job.scenario.id
     try:
         if (shared := job.options.renderer) is not None:
-            link_to(shared.address).waiting = lambda: say(Waits(name, "waits for the shared renderer"))
+            link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
             driver,

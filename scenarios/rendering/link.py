@@ -10,7 +10,6 @@ import select
 import socket
 from collections.abc import Callable
 from contextlib import suppress
-from functools import lru_cache
 from types import TracebackType
 from typing import Final, Self
 
@@ -49,7 +48,7 @@ class RendererLink:
     """The connection. renderer: what draws, as records name it. waiting: called now and then while a reply is waited
     for. Raises RendererLost, here and whenever it is used, when the renderer is gone."""
 
-    def __init__(self, address: str, waiting: Callable[[], None]) -> None:
+    def __init__(self, address: str, waiting: Callable[[], None] | None = None) -> None:
         self.waiting = waiting
         self._number = 0
         self._memory: PictureMemory | None = None
@@ -60,7 +59,7 @@ class RendererLink:
             self._wait()
             _, (descriptor,), *_ = socket.recv_fds(self._end, 1, 1)
             welcome = self._received()
-        except (OSError, ValueError, EOFError) as error:
+        except (OSError, ValueError, EOFError, msgspec.DecodeError) as error:
             raise self.lost() from error
         assert isinstance(welcome, Welcome)
         self._number, self.renderer = welcome.number, welcome.renderer
@@ -97,7 +96,7 @@ class RendererLink:
 
     def lost(self, asked: str = "") -> RendererLost:
         """The error for a connection that is of no use any more; the next one is made anew."""
-        link_to.cache_clear()
+        _links.clear()
         self._wire.close()
         if self._memory is not None:
             asked = asked if self._memory.asked else ""
@@ -112,17 +111,21 @@ class RendererLink:
 
     def _wait(self) -> None:
         while not select.select([self._end], [], [], _TELLS_EVERY_S)[0]:
-            self.waiting()
+            if self.waiting is not None:
+                self.waiting()
 
 
-@lru_cache(maxsize=1)
-def link_to(address: str) -> RendererLink:
-    """This process's connection to the renderer at an address, made when it is first needed."""
-    return RendererLink(address, _unheard)
+def link_to(address: str, waiting: Callable[[], None] | None = None) -> RendererLink:
+    """This process's connection to the renderer at an address, made when it is first needed. waiting: called from now
+    on while a reply is waited for, that to the connection too: a renderer that loads a large policy lets it wait."""
+    if address not in _links:
+        _links[address] = RendererLink(address, waiting)
+    elif waiting is not None:
+        _links[address].waiting = waiting
+    return _links[address]
 
 
-def _unheard() -> None:
-    """Nobody wants to know."""
+_links: Final[dict[str, RendererLink]] = {}
 
 
 class SharedCamera:

@@ -18,10 +18,7 @@ from cosim.core.errors import EngineError
 from cosim.core.geometry import Pose, headings_from_sumo
 from cosim.core.state import (
     NO_VEHICLES,
-    Age,
-    Doing,
     People,
-    PersonKind,
     RobotState,
     Street,
     Vehicles,
@@ -29,7 +26,6 @@ from cosim.core.state import (
     write_protected,
 )
 from cosim.episode.ports import Crowd
-from cosim.people.gait import Strides
 from cosim.people.yielding import RobotBody
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
@@ -39,24 +35,20 @@ from sumo_nets import engine
 from sumo_nets.crowd.demand import LINGER_M, VEHICLE_REACH_M, Drivers, Pedestrians, Seen
 from sumo_nets.crowd.demand_log import Entrances
 from sumo_nets.crowd.demand_replay import replayed_demand
+from sumo_nets.crowd.empty_street import TICK_MS, start_of
 from sumo_nets.crowd.group_cohesion import Together
-from sumo_nets.crowd.lights import Signals
-from sumo_nets.crowd.pose_filter import PERSON_STANDS_MPS, PoseFilter
+from sumo_nets.crowd.lights import Signals, SumoLights
+from sumo_nets.crowd.pose_filter import PoseFilter
 from sumo_nets.crowd.proxy import Proxy, Walks
+from sumo_nets.crowd.shown_people import ShownPeople, cast_in_order, places_of
 from sumo_nets.crowd.waiting_spots import Kerbs
 from sumo_nets.engine import NearPersons, NearVehicles, sumo, translated
-
-TICK_MS = 50
-"""One step of SUMO."""
 
 _ROLL_TICKS = 10
 """How often persons and vehicles come and go."""
 
 _WARM_UP_S = 8.0
 """How long the vehicles drive before the first tick; persons walk at once."""
-
-SIGNAL_CLOCK_S = 3600
-"""The signals' clocks start somewhere in this span, drawn from the seed."""
 
 _BERTH_M = (0.3, 0.45)
 """To SUMO's walkers the robot is so much longer and wider than it is: they pass it wide."""
@@ -97,8 +89,8 @@ class SumoCrowd(Crowd):
                 "a SumoCrowd is already running in this process, and SUMO can run only once per process: "
                 "close it first, or use another process"
             )
-        rng_sumo, rng_persons, rng_vehicles = np.random.default_rng(self._seed).spawn(3)
-        self._launch(int(rng_sumo.integers(2**31)), int(rng_sumo.integers(SIGNAL_CLOCK_S)))
+        _, rng_persons, rng_vehicles = np.random.default_rng(self._seed).spawn(3)
+        self._launch(*start_of(self._seed))
         SumoCrowd._running = self
         try:
             with translated("setting up the crowd"):
@@ -144,10 +136,11 @@ class SumoCrowd(Crowd):
                 self._drivers.roll(x_m, y_m, _seen(sumo.vehicle.getWaitingTime, vehicles))
             if not absent:
                 self._robot.update(robot.pose)
+            cast = cast_in_order(reply.actors, self._pedestrians.ages)
             self._mirror(reply.actors)
             sumo.simulationStep()
             body = None if absent else RobotBody(robot.pose, self._half_m, robot.v_mps)
-            self._street = self._read(tick + 1, x_m, y_m, reply.actors, body)
+            self._street = self._read(tick + 1, x_m, y_m, cast, body)
         return self._street
 
     def _launch(self, sumo_seed: int, begin_s: int) -> None:
@@ -167,7 +160,7 @@ class SumoCrowd(Crowd):
             sumo.vehicletype.setWidth(kind, width_m)
             sumo.vehicletype.setMinGap(kind, gap_m)
         self._walks = Walks(sumo, self._map)
-        self._signals = Signals(sumo, self._map)
+        self._signals = Signals(SumoLights(sumo, self._map), self._map)
         self._kerbs = Kerbs(self._map)
         self._together = Together(sumo, self._map.strips, TICK_MS / 1000)
         self._pedestrians, self._drivers = self._demand(rng_persons, rng_vehicles)
@@ -175,8 +168,7 @@ class SumoCrowd(Crowd):
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
         self._poses = PoseFilter(TICK_MS / 1000)
-        self._strides = Strides(TICK_MS / 1000)
-        self._cast: tuple[tuple[str, ...], list[tuple[str, PersonKind, Age]]] | None = None
+        self._shown = ShownPeople(TICK_MS / 1000)
         self._sized = NO_VEHICLES.ids, NO_VEHICLES.size
         if self._spec.vehicles:
             self._drivers.fill(x_m, y_m)
@@ -184,7 +176,7 @@ class SumoCrowd(Crowd):
                 sumo.simulationStep()
         self._pedestrians.fill(x_m, y_m)
         sumo.simulationStep()
-        self._street = self._read(0, x_m, y_m, (), None)
+        self._street = self._read(0, x_m, y_m, [], None)
 
     def _demand(
         self, rng_persons: np.random.Generator, rng_vehicles: np.random.Generator
@@ -199,8 +191,6 @@ class SumoCrowd(Crowd):
 
     def _mirror(self, actors: tuple[Actor, ...]) -> None:
         present = {actor.id for actor in actors}
-        if len(present) != len(actors) or present & self._pedestrians.ages.keys():
-            raise EngineError(f"actors need unique ids, and none of the crowd's: {[a.id for a in actors]}")
         for name in sorted(self._actors.keys() - present):
             self._actors.pop(name).remove()
         for actor in actors:
@@ -208,41 +198,19 @@ class SumoCrowd(Crowd):
                 self._actors[actor.id] = Proxy(sumo, self._walks, base=actor.id, kind="event", serial=self._serial)
             self._actors[actor.id].update(Pose(actor.x_m, actor.y_m, actor.heading_rad))
 
-    def _read(self, tick: int, x_m: float, y_m: float, actors: tuple[Actor, ...], body: RobotBody | None) -> Street:
+    def _read(self, tick: int, x_m: float, y_m: float, cast: list[Actor], body: RobotBody | None) -> Street:
         persons = engine.persons_near(x_m, y_m, self._spec.radius_m + LINGER_M, self._pedestrians.ages)
         self._found = persons, vehicles = persons, engine.vehicles_near(x_m, y_m, VEHICLE_REACH_M)
-        people = self._people(persons, actors, body)
+        people = self._people(persons, cast, body)
         return Street(tick, people, self._vehicles(vehicles), self._signals.near(x_m, y_m))
 
-    def _people(self, persons: NearPersons, actors: tuple[Actor, ...], body: RobotBody | None) -> People:
+    def _people(self, persons: NearPersons, cast: list[Actor], body: RobotBody | None) -> People:
         xy = persons.xy
         if red := self._signals.red(persons.ahead):
             xy = xy.copy()
             xy[red] = self._kerbs.behind([persons.ahead[i] for i in red], xy[red])
-        cast = sorted(actors, key=lambda actor: actor.id)
-        others = np.array([(a.x_m, a.y_m) for a in cast], dtype=float).reshape(-1, 2)
-        xy, heading, speed = self._poses.update(persons.names, xy, persons.mps, _facing, body, others)
-        if (persons.names, cast_of := [(a.id, a.kind, a.age) for a in cast]) != self._cast:
-            self._cast = persons.names, cast_of
-            self._names = (*persons.names, *(a.id for a in cast))
-            ages = [*(self._pedestrians.ages[name] for name in persons.names), *(a.age for a in cast)]
-            kinds = [*[PersonKind.CROWD] * len(xy), *(a.kind for a in cast)]
-            self._kind, self._age = write_protected(kinds, np.int8), write_protected(ages, np.int8)
-        doing: list[Doing] = ["walk" if walks else "stand" for walks in (speed > PERSON_STANDS_MPS).tolist()]
-        places = np.concatenate([xy, others])
-        paces = np.concatenate([speed, [a.speed_mps if a.pace_mps is None else a.pace_mps for a in cast]])
-        strides, paces = self._strides.update(self._names, places, paces, self._age)
-        return People(
-            self._names,
-            frozen(places),
-            frozen(np.concatenate([heading, [a.heading_rad for a in cast]])),
-            frozen(np.concatenate([speed, [a.speed_mps for a in cast]])),
-            (*doing, *(a.doing for a in cast)),
-            frozen(strides),
-            frozen(paces),
-            self._kind,
-            self._age,
-        )
+        shown = self._poses.update(persons.names, xy, persons.mps, _facing, body, places_of(cast))
+        return self._shown.together(cast, self._pedestrians.ages, persons.names, *shown)
 
     def _vehicles(self, near: NearVehicles) -> Vehicles:
         """SUMO's position is the middle of the front bumper; the street's is the middle of the box."""

@@ -8,11 +8,13 @@ places, at the same times, and each of them can be compared with itself.
 from __future__ import annotations
 
 from collections import defaultdict
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from cosim.core.state import Age
 from sumo_nets.crowd.proxy import KEEP_ROUTE, MATCH_M
-from sumo_nets.engine import Sumo
+
+if TYPE_CHECKING:  # a street that goes by itself does without SUMO
+    from sumo_nets.engine import Sumo
 
 
 class PersonEntry(NamedTuple):

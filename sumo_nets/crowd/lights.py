@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Final, NamedTuple, Protocol
 
 import numpy as np
 
 from cosim.core.state import Signal
-from cosim.place.street_map import StreetMap
-from sumo_nets.engine import Sumo
+from cosim.place.street_map import SignalPlan, StreetMap
+
+if TYPE_CHECKING:  # who shows planned lights does without SUMO
+    from sumo_nets.engine import Sumo
 
 _NEAR_M = 80.0
 """The signals of crossings within this distance of the robot are shown."""
@@ -19,9 +23,103 @@ RESELECT_M = 5.0
 
 _WALK = "Gg"
 
+_MS: Final = 1000
+
+
+class Showing(NamedTuple):
+    """What a signal shows: whether one may walk, the time at which that changes, None for unknown or never, and the
+    time until which this holds, in seconds of SUMO's time."""
+
+    walk: bool
+    change_s: float | None
+    until_s: float
+
+
+class Lights(Protocol):
+    """Tells what signals show. crossings: those that have one."""
+
+    crossings: Collection[str]
+
+    def now_s(self) -> float:
+        """SUMO's time."""
+
+    def showing(self, crossing: str) -> Showing:
+        """What a crossing's signal shows now."""
+
 
 class Signals:
-    """Every signalised crossing's link; programs are read once, states once per switch."""
+    """The signals of all crossings; their lights are asked once per switch."""
+
+    def __init__(self, lights: Lights, street_map: StreetMap) -> None:
+        self._lights = lights
+        self._ids = sorted(lights.crossings)
+        self._lit = frozenset(self._ids)
+        middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
+        self._xy = np.array(middles, dtype=float).reshape(-1, 2)
+        self._shown: dict[str, Showing] = {}
+        self._centre: tuple[float, float] | None = None
+        self._near: list[str] = []
+
+    def near(self, x_m: float, y_m: float) -> Mapping[str, Signal]:
+        """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
+        if self._centre is None or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
+            self._centre = (x_m, y_m)
+            gap = self._xy - (x_m, y_m)
+            self._near = [self._ids[i] for i in np.flatnonzero((gap * gap).sum(axis=1) <= _NEAR_M * _NEAR_M)]
+        now_s = self._lights.now_s()
+        signals = {}
+        for crossing in self._near:
+            walk, change_s, _ = self._state(crossing, now_s)
+            signals[crossing] = Signal(walk, None if change_s is None else round(change_s - now_s, 3))
+        return MappingProxyType(signals)
+
+    def red(self, crossings: Sequence[str]) -> list[int]:
+        """The places in `crossings` of those that have a signal that forbids walking."""
+        now_s = self._lights.now_s()
+        return [i for i, one in enumerate(crossings) if one in self._lit and not self._state(one, now_s).walk]
+
+    def is_red(self, crossing: str) -> bool:
+        """Whether a crossing has a signal and it forbids walking."""
+        return bool(self.red([crossing]))
+
+    def _state(self, crossing: str, now_s: float) -> Showing:
+        shown = self._shown.get(crossing)
+        if shown is None or now_s >= shown.until_s:
+            self._shown[crossing] = shown = self._lights.showing(crossing)
+        return shown
+
+
+class PlannedLights:
+    """The signals of a map whose plans tell all of them: what SUMO would show, without it. begin_s: when SUMO would
+    have been started; `now_ms` is set to its time."""
+
+    def __init__(self, street_map: StreetMap, begin_s: int) -> None:
+        self._strips = street_map.strips
+        self.crossings: Collection[str] = [strip.id for strip in self._strips.values() if strip.plan is not None]
+        self.now_ms = _MS * begin_s
+
+    def now_s(self) -> float:
+        return self.now_ms / _MS
+
+    def showing(self, crossing: str) -> Showing:
+        """SUMO switches within the step that begins with or before the moment of it, so that the moment itself still
+        shows what was before."""
+        plan: SignalPlan | None = self._strips[crossing].plan
+        assert plan is not None, crossing
+        ends_ms = list(itertools.accumulate(plan.durations_ms))
+        last_ms = self.now_ms - 1
+        since_ms = (last_ms - plan.offset_ms) % ends_ms[-1]
+        now = next(k for k, end_ms in enumerate(ends_ms) if since_ms < end_ms)
+        until_ms = change_ms = last_ms + ends_ms[now] - since_ms
+        for k in range(now + 1, now + len(ends_ms)):
+            if plan.walks[k % len(ends_ms)] != plan.walks[now]:
+                return Showing(plan.walks[now], change_ms / _MS, until_ms / _MS)
+            change_ms += plan.durations_ms[k % len(ends_ms)]
+        return Showing(plan.walks[now], None, until_ms / _MS)
+
+
+class SumoLights:
+    """The signals that SUMO simulates; programs are read once."""
 
     def __init__(self, engine: Sumo, street_map: StreetMap) -> None:
         self._engine = engine
@@ -32,47 +130,16 @@ class Signals:
                     edge = to.rsplit("_", 1)[0]
                     if edge in street_map.strips and street_map.strips[edge].kind == "crossing":
                         self._link.setdefault(edge, (light, index))
-        self._ids = sorted(self._link)
-        middles = [street_map.strips[i].line.mean(axis=0) for i in self._ids]
-        self._xy = np.array(middles, dtype=float).reshape(-1, 2)
+        self.crossings: Collection[str] = self._link.keys()
+        self.now_s = engine.simulation.getTime
         self._phases: dict[str, tuple[tuple[float, str], ...] | None] = {}
-        self._until: dict[str, float] = {}
-        self._shown: dict[str, tuple[bool, float | None]] = {}
-        self._centre: tuple[float, float] | None = None
-        self._near: list[str] = []
 
-    def near(self, x_m: float, y_m: float) -> Mapping[str, Signal]:
-        """The signals within NEAR_M (up to RESELECT_M more or less) of a point, now."""
-        if self._centre is None or np.hypot(x_m - self._centre[0], y_m - self._centre[1]) > RESELECT_M:
-            self._centre = (x_m, y_m)
-            gap = self._xy - (x_m, y_m)
-            self._near = [self._ids[i] for i in np.flatnonzero((gap * gap).sum(axis=1) <= _NEAR_M * _NEAR_M)]
-        now_s = self._engine.simulation.getTime()
-        signals = {}
-        for crossing in self._near:
-            walk, change_s = self._state(crossing, now_s)
-            signals[crossing] = Signal(walk, None if change_s is None else round(change_s - now_s, 3))
-        return MappingProxyType(signals)
-
-    def red(self, crossings: Sequence[str]) -> list[int]:
-        """The places in `crossings` of those that have a signal that forbids walking."""
-        now_s = self._engine.simulation.getTime()
-        return [i for i, one in enumerate(crossings) if one in self._link and not self._state(one, now_s)[0]]
-
-    def is_red(self, crossing: str) -> bool:
-        """Whether a crossing has a signal and it forbids walking."""
-        return crossing in self._link and not self._state(crossing, self._engine.simulation.getTime())[0]
-
-    def _state(self, crossing: str, now_s: float) -> tuple[bool, float | None]:
-        """Whether one may walk, and the time at which that changes."""
-        if now_s >= self._until.get(crossing, 0.0):
-            light, index = self._link[crossing]
-            traffic_light = self._engine.trafficlight
-            next_s = traffic_light.getNextSwitch(light)
-            walk = traffic_light.getRedYellowGreenState(light)[index] in _WALK
-            self._until[crossing] = next_s if self._program(light) else now_s
-            self._shown[crossing] = (walk, self._change(light, index, walk, next_s))
-        return self._shown[crossing]
+    def showing(self, crossing: str) -> Showing:
+        light, index = self._link[crossing]
+        traffic_light = self._engine.trafficlight
+        next_s = traffic_light.getNextSwitch(light)
+        walk = traffic_light.getRedYellowGreenState(light)[index] in _WALK
+        return Showing(walk, self._change(light, index, walk, next_s), next_s if self._program(light) else self.now_s())
 
     def _change(self, light: str, index: int, walk: bool, next_s: float) -> float | None:
         phases = self._program(light)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import shapely
 from shapely.geometry import LineString
@@ -18,7 +18,9 @@ from shapely.geometry import LineString
 from cosim.core.geometry import Circle, Pose, heading_to_sumo
 from cosim.place.street_map import Located, StreetMap
 from sumo_nets.crowd.sidewalk_lead import SidewalkLead
-from sumo_nets.engine import Sumo
+
+if TYPE_CHECKING:  # a street that goes by itself does without SUMO
+    from sumo_nets.engine import Sumo
 
 KEEP_ROUTE = 3
 """moveToXY: keep the walk, may leave the network. The only mode that neither crashes nor clamps."""

@@ -9,11 +9,13 @@ that is the nearest of both kinds both ways end alike.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
 
 import shapely
 from shapely.geometry import LineString
 
-from sumo_nets.engine import Sumo
+if TYPE_CHECKING:  # a street that goes by itself does without SUMO
+    from sumo_nets.engine import Sumo
 
 
 class SidewalkLead:

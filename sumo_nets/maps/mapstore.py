@@ -127,7 +127,8 @@ def read_map(place: CityMap | str) -> StreetMap:
     path = map_net(place)
     street_map, features = street_map_of(path), read_features(path.with_name(NAME))
     known_as = with_features(street_map.net_hash, path.with_name(NAME))
-    return dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
+    whole = dataclasses.replace(street_map, name=name, features=features, net_hash=known_as)
+    return whole.read_of(f"{street_map.made_of}-{known_as}")
 
 
 def map_hash(net: Path) -> str:

@@ -27,6 +27,7 @@ from sumo_nets.net.elevation import land_of, steep_ports, steep_strips
 from sumo_nets.net.net_hash import hash_of
 from sumo_nets.net.outlines import areas_of, bands, coordinates, polylines
 from sumo_nets.net.seams import close_seams
+from sumo_nets.net.signal_plans import SignalPrograms
 
 LANE_M = 3.2
 """SUMO's width of a lane, sidewalks included, that names none."""
@@ -77,6 +78,7 @@ class _Raw:
     edges: list[_Edge] = field(default_factory=list)
     junctions: list[Attributes] = field(default_factory=list)
     links: list[Attributes] = field(default_factory=list)
+    programs: SignalPrograms = field(default_factory=SignalPrograms)
 
 
 def _parse(path: Path, data: bytes) -> _Raw:
@@ -108,6 +110,8 @@ def _parse(path: Path, data: bytes) -> _Raw:
             raw.location = attributes
         elif tag == "net":
             raw.net = attributes
+        else:
+            raw.programs.add(tag, parent, attributes)
 
     def end(_tag: str) -> None:
         stack.pop()
@@ -161,10 +165,12 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
     with np.errstate(divide="ignore", invalid="ignore"):
         # Slivers in foreign nets have mitres at infinity, which GEOS cuts off by itself.
         polygons[: len(walk)] = close_seams(polygons[: len(walk)], lines[: len(walk)], widths[: len(walk)], met)
+    plans = raw.programs.plans(raw.links, signalised)
     strips: dict[str, Strip] = {}
     for k, (name, (edge, _, index)) in enumerate(walk.items()):
         ends = ports.get((name, 0)), ports.get((name, 1))
-        strips[name] = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends, name in signalised)
+        made = _strip(edge, index, left_hand, lines[k], float(widths[k]), polygons[k], ends)
+        strips[name] = replace(made, signalised=True, plan=plans.get(name)) if name in signalised else made
     roads = {
         lane["id"]: Lane(
             id=lane["id"],
@@ -305,7 +311,6 @@ def _strip(
     width_m: float,
     polygon: Polygon,
     corners: tuple[str | None, str | None],
-    signalised: bool,
 ) -> Strip:
     name = edge.attributes["id"]
     if edge.attributes.get("function") == "crossing":
@@ -317,8 +322,7 @@ def _strip(
             width_m,
             polygon,
             corners,
-            signalised,
-            crosses,
+            crosses=crosses,
             frontage_m=0.0,
             curb_m=0.0,
             road_side=0,

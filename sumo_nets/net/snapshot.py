@@ -55,10 +55,11 @@ def street_map_of(path: Path) -> StreetMap:
         net = path.read_bytes()
     except OSError:
         return _read(path)
-    kept = cache_folder() / SNAPSHOT_FOLDER / f"{_key(path.name, net)}.map"
+    made_of = _key(path.name, net)
+    kept = cache_folder() / SNAPSHOT_FOLDER / f"{made_of}.map"
     with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
-        return thawed(kept.read_bytes())
-    street_map = _read(path)
+        return thawed(kept.read_bytes()).read_of(made_of)
+    street_map = _read(path).read_of(made_of)
     try:
         _write(kept, map_as_bytes(street_map))
     except OSError as error:

@@ -83,7 +83,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         whole = build_long_horizon(city, street_map, graph, i, f"t-{i}")
         fields = {name: getattr(whole, name) for name in Scenario.__struct_fields__}
         crowd = CrowdSpec(persons=8, radius_m=50.0, vehicles=2)
-        scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 2.0}))
+        scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 1.0}))
     for name, count in (("tiny", 3), ("four", 4)):
         write_suite(Suite(name=name, version="1", scenarios=tuple(scenarios[:count])), folder / f"{name}.json")
     (folder / "mine.py").write_text(POLICIES)
@@ -133,9 +133,9 @@ def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
 
 
 @pytest.fixture(scope="module")
-def whole_run(desk: Path, fresh_cosim: Cosim) -> Path:
+def whole_run(desk: Path, cosim: Cosim) -> Path:
     """The tiny suite, run without interruption by one process, the camera on."""
-    done = fresh_cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", "whole", cwd=desk)
+    done = cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", "whole", cwd=desk)
     assert done.returncode == 0, done.stderr
     return desk / "whole"
 
@@ -144,9 +144,9 @@ HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--out")
 
 
 @pytest.fixture(scope="module")
-def unbroken(desk: Path, fresh_cosim: Cosim) -> bytes:
+def unbroken(desk: Path, cosim: Cosim) -> bytes:
     """The table of a run of two episodes that nothing has interrupted."""
-    done = fresh_cosim("run", *HELD, "unbroken", cwd=desk)
+    done = cosim("run", *HELD, "unbroken", cwd=desk)
     assert done.returncode == 0, done.stderr
     return (desk / "unbroken/results.csv").read_bytes()
 

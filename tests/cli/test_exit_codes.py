@@ -52,7 +52,7 @@ def test_every_error_has_its_exit_code() -> None:
         (("map", "import", "nothing.osm"), 2),
         (("show", "damaged"), 2),
         (("city", "make", "--seed", "1", "--size", "300", "file/city"), 3),
-        (("run", "long-horizon", "--policy", "stop", "--camera", "bullet", "--out", "file/run"), 3),
+        (("run", "reactive", "--policy", "orca", "--episodes", "1", "--out", "file/run"), 3),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else str(value),
 )

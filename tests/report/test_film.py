@@ -29,7 +29,7 @@ pytestmark = pytest.mark.engine
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
+def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     """A folder with a suite of one short scenario, and a run of it."""
     from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
@@ -42,7 +42,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Path:
         whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
-    done = fresh_cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
+    done = cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
 

@@ -34,7 +34,7 @@ pytestmark = pytest.mark.engine
 
 SMALL = City(seed=5, size_m=500.0)
 OPEN: frozenset[Port] = frozenset()
-TICKS = 600
+TICKS = 400
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,7 @@ def scenario() -> Scenario:
 
 
 def streets(scenario: Scenario, robot: RobotState, absent: bool) -> tuple[list[Street], Entrances]:
-    """Half a minute around a robot that stands, or does not, where it is put."""
+    """Twenty seconds around a robot that stands, or does not, where it is put."""
     with crowd_of(scenario) as crowd:
         return [crowd.step(robot, nobody(tick), absent=absent) for tick in range(TICKS)], crowd.entrances
 

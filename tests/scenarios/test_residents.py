@@ -273,12 +273,12 @@ def test_who_sits_down_and_gets_up_does_not_jump() -> None:
 
 
 def test_residents_keep_out_of_things_people_and_the_robot() -> None:
-    """Four minutes beside a robot that drives: never in a prop or house by a disk's radius, never within 0.45 m of
-    somebody, never within the robot's outline."""
+    """75 seconds in each of two cities beside a robot that drives: never in a prop or house by a disk's radius, never
+    within 0.45 m of somebody, never within the robot's outline."""
     for city in CITIES[:2]:
         one = town(*city)
         tree = shapely.STRtree(list(one.things))
-        for moment in lived(one, 120.0, count=12):
+        for moment in lived(one, 75.0, count=12):
             if not len(moment.people) > 2:
                 continue
             xy = moment.people.xy[2:]

@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from tests.conftest import PATIENCE_S
-from tests.scenarios.in_turn import COUNT
+from tests.scenarios.in_turn import COUNT, SAMPLE_COUNT
 
 NOT_DRIVEN_WITH = (
     "pandas",
@@ -23,24 +23,28 @@ NOT_DRIVEN_WITH = (
 
 
 def test_an_episode_imports_only_what_it_drives_with() -> None:
-    """Neither what reads maps, nor SUMO's tools in Python, nor tables; who imports libsumo besides gets all of it."""
+    """Neither what reads maps, nor SUMO's tools in Python, nor tables, nor SUMO before somebody is to be simulated; who
+    imports libsumo besides gets all of it."""
     code = (
         "import sys, cosim\n"
         "cosim.Episode\n"
-        f"print(sorted(set({NOT_DRIVEN_WITH}) & set(sys.modules)))\n"
+        f"print(sorted(set({NOT_DRIVEN_WITH}) & set(sys.modules)), 'sumo_nets.engine' in sys.modules)\n"
         "from sumo_nets.engine import sumo\n"
         "import libsumo\n"
         "print(libsumo.person is sumo.person and libsumo.isLibsumo())"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split("\n")[-3:-1] == ["[]", "True"]
+    assert done.stdout.split("\n")[-3:-1] == ["[] False", "True"]
 
 
 @pytest.mark.engine
-def test_the_kth_episode_of_a_process_is_the_first_one_of_another() -> None:
-    """30 episodes, two cities, many crowds, grounds, robots and lights in random order: same states, same pictures."""
-    command = [sys.executable, "-m", "tests.scenarios.in_turn"]
+def test_the_kth_episode_of_a_process_is_the_first_one_of_another(request: pytest.FixtureRequest) -> None:
+    """Ten episodes, 30 with --whole, two cities, many crowds, grounds, robots and lights in random order: same states,
+    same pictures."""
+    whole = request.config.getoption("--whole")
+    count, only = (COUNT, []) if whole else (SAMPLE_COUNT, ["--sample"])
+    command = [sys.executable, "-m", "tests.scenarios.in_turn", *only]
     done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=False)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split("\n")[-2] == f"[] {COUNT} {COUNT}", done.stderr
+    assert done.stdout.split("\n")[-2] == f"[] {count} {count}", done.stderr

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 import signal
+import socket
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ from scenarios.execution import suite_run
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.places import place
+from scenarios.execution.wire import Wire
 from scenarios.rendering.exchange import (
     Ask,
     Begin,
@@ -42,10 +44,11 @@ from scenarios.rendering.exchange import (
     Reply,
     Request,
     Told,
+    Welcome,
     decode_request,
     encode_exchange,
 )
-from scenarios.rendering.link import RendererLink
+from scenarios.rendering.link import RendererLink, link_to
 from scenarios.rendering.memory import PictureMemory
 from scenarios.rendering.shared import End, SharedRenderer, check_shared
 from tests.conftest import Cosim
@@ -76,7 +79,7 @@ def renderer_for(folder: Path, policy: Policy, patience: Patience = Patience()) 
 
 
 def linked(renderer: SharedRenderer) -> RendererLink:
-    return RendererLink(renderer.at.address, lambda: None)
+    return RendererLink(renderer.at.address)
 
 
 def renderer_pid(renderer: SharedRenderer) -> int:
@@ -155,6 +158,27 @@ def test_pictures_and_labels_are_those_of_a_camera_of_ones_own(tmp_path: Path) -
         end = renderer.end_of(1)
         assert end is not None and end.words == "the renderer process was killed by SIGKILL"
     assert {*Path("/dev/shm").iterdir()} == before
+
+
+def test_who_connects_says_that_it_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A renderer that is still loading its policy accepts nobody for as long as that takes: an environment that was
+    silent meanwhile would be taken for one that hangs."""
+    monkeypatch.setattr("scenarios.rendering.link._TELLS_EVERY_S", 0.01)
+    address, memory, waited = f"cosim-test-{os.getpid()}", PictureMemory.new((0, 0)), []
+    with socket.socket(socket.AF_UNIX) as listening:
+        listening.bind(f"\0{address}")
+        listening.listen()
+
+        def accept() -> None:
+            end, _ = listening.accept()
+            waited.append(end)
+            socket.send_fds(end, [b"\0"], [memory.descriptor])
+            Wire(end).send(encode_exchange(Welcome(1, "late", (0, 0))))
+
+        made = link_to(address, accept)
+        assert made.renderer == "late" and len(waited) == 1 and link_to(address) is made
+        made.lost()
+    memory.close()
 
 
 def knows(tick: int, v_mps: float = 0.5) -> Ask:

@@ -20,7 +20,7 @@ from sumo_nets.city.blocks import CLASSES, bend, corner, direction, length, ring
 from sumo_nets.city.city import STYLES, plan_city
 from sumo_nets.city.plan import CityPlan
 from sumo_nets.city.signals import signal_faults
-from sumo_nets.city.store import build_city, city_net
+from sumo_nets.city.store import city_net
 from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 from sumo_nets.net.net_hash import net_content_hash
 from sumo_nets.net.netconvert import netconvert
@@ -30,15 +30,15 @@ SAMPLE = [(1, 200.0, "mixed"), (2, 450.0, "suburb"), (3, 700.0, "downtown"), (4,
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, float, str], Path]:
+def built() -> dict[tuple[int, float, str], Path]:
     """The nets of SAMPLE."""
-    folder = tmp_path_factory.mktemp("cities")
-    paths = {}
-    for seed, size_m, style in SAMPLE:
-        city = City(seed=seed, size_m=size_m, style=style)
-        paths[seed, size_m, style] = folder / f"{city.name}.net.xml"
-        build_city(city, paths[seed, size_m, style])
-    return paths
+    return {one: city_net(City(seed=one[0], size_m=one[1], style=one[2])) for one in SAMPLE}
+
+
+@pytest.fixture(scope="module")
+def read(built: dict[tuple[int, float, str], Path]) -> dict[tuple[int, float, str], StreetMap]:
+    """The maps that are read of them."""
+    return {one: read_net(path) for one, path in built.items()}
 
 
 def groups(place: StreetMap) -> list[set[str]]:
@@ -161,10 +161,9 @@ def test_cities_out_of_range_are_refused() -> None:
 
 
 @pytest.mark.engine
-def test_built_city_is_one_walkable_whole(built: dict[tuple[int, float, str], Path]) -> None:
+def test_built_city_is_one_walkable_whole(read: dict[tuple[int, float, str], StreetMap]) -> None:
     """Every strip has a corner at both ends, is reachable from every other one, and 99 % of the area is one piece."""
-    for path in built.values():
-        place = read_net(path)
+    for place in read.values():
         assert all(None not in strip.corners for strip in place.strips.values())
         assert len(groups(place)) == 1
         areas = [part.area for part in shapely.get_parts(place.walkable)]
@@ -172,10 +171,10 @@ def test_built_city_is_one_walkable_whole(built: dict[tuple[int, float, str], Pa
 
 
 @pytest.mark.engine
-def test_built_city_keeps_the_zones_of_its_plan(built: dict[tuple[int, float, str], Path]) -> None:
+def test_built_city_keeps_the_zones_of_its_plan(read: dict[tuple[int, float, str], StreetMap]) -> None:
     """Sidewalks carry the widths of their street class, the road on their left and verges between."""
     sections = {edge.id: edge for edge in plan_city(*SAMPLE[3]).edges}
-    place = read_net(built[SAMPLE[3]])
+    place = read[SAMPLE[3]]
     lanes: dict[str, list[tuple[str, float]]] = defaultdict(list)
     for lane in place.lanes.values():
         if not lane.internal:
@@ -198,11 +197,13 @@ def test_built_city_keeps_the_zones_of_its_plan(built: dict[tuple[int, float, st
 
 
 @pytest.mark.engine
-def test_every_signalised_crossing_has_time_to_cross(built: dict[tuple[int, float, str], Path]) -> None:
+def test_every_signalised_crossing_has_time_to_cross(
+    built: dict[tuple[int, float, str], Path], read: dict[tuple[int, float, str], StreetMap]
+) -> None:
     """Crossings get 8 s of green and are cleared at 1.1 m/s before cars go; no two links clash."""
     for path in built.values():
         assert signal_faults(path.read_bytes()) == []
-    assert sum(strip.signalised for strip in read_net(built[SAMPLE[4]]).strips.values()) > 100
+    assert sum(strip.signalised for strip in read[SAMPLE[4]].strips.values()) > 100
 
 
 @pytest.mark.engine

@@ -98,17 +98,17 @@ def test_the_first_street_is_populated_and_clear_around_the_robot(place: Place) 
 
 
 def test_the_crowd_follows_a_robot_that_travels(place: Place) -> None:
-    """Over 200 m of the robot's way about as many persons as asked for are within the radius, none appears near it."""
+    """Over 120 m of the robot's way about as many persons as asked for are within the radius, none appears near it."""
     start = middle(place)
     reach = place.graph.reach(Port(place.map.locate(*start[:2]).edge, 0))
-    path = reach.path(reach.within(230.0, 400.0)[0])
+    path = reach.path(reach.within(140.0, 300.0)[0])
     assert path is not None
     line = Polyline([place.graph.point(port) for port in path])
     spec = CrowdSpec(persons=40, radius_m=80.0, vehicles=12)
     inside, vehicles, appeared = [], [], []
     with SumoCrowd(place.net, place.map, spec, 5, OPEN, start[:2]) as crowd:
         known: set[str] = set(crowd.street.people.ids)
-        for tick in range(2000):
+        for tick in range(1200):
             pose = line.at(0.1 * tick)
             street = crowd.step(at(pose), reply(tick))
             near = gaps(street, pose)
@@ -117,7 +117,7 @@ def test_the_crowd_follows_a_robot_that_travels(place: Place) -> None:
             if tick % 20 == 0:
                 inside.append(int((near < 80.0).sum()))
                 vehicles.append(len(street.vehicles))
-    assert street.tick == 2000
+    assert street.tick == 1200
     assert 36 <= np.mean(inside) <= 44 and min(inside) >= 28
     assert np.mean(vehicles) >= 9
     assert len(appeared) > 10 and min(appeared) > 34.0
@@ -144,12 +144,12 @@ def test_a_density_is_reached_and_kept_on_the_way(place: Place) -> None:
 
 
 def test_people_keep_a_distance_from_a_standing_robot(place: Place) -> None:
-    """In a minute and a half beside a standing robot people pass on the sidewalk, nobody nearer than 0.5 m."""
+    """In a minute beside a standing robot people pass on the sidewalk, nobody nearer than 0.5 m."""
     start = middle(place)
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest, passed = math.inf, set()
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
-        for tick in range(1800):
+        for tick in range(1200):
             street = crowd.step(at(start), reply(tick))
             near = gaps(street, start)
             nearest = min(nearest, float(near.min()))
@@ -171,7 +171,7 @@ def test_an_absent_robot_is_walked_through(place: Place) -> None:
 
 
 def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
-    """In two minutes next to signals people wait and start over crossings, none once it has been red for 2 s.
+    """In 80 seconds next to signals people wait and start over crossings, none once it has been red for 2 s.
 
     Two seconds is what a slow walker needs from the kerb to the inner part, where the test sees it.
     """
@@ -186,7 +186,7 @@ def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
     red_s: dict[str, float] = {}
     waiting = 0
     with SumoCrowd(place.net, place.map, spec, 6, OPEN, start[:2]) as crowd:
-        for tick in range(2400):
+        for tick in range(1600):
             street = crowd.step(at(start), reply(tick))
             now: dict[str, str] = {}
             for crossing, signal in street.signals.items():
@@ -201,12 +201,12 @@ def test_nobody_enters_a_signalised_crossing_on_red(place: Place) -> None:
 
 
 def test_vehicles_stop_at_red(place: Place) -> None:
-    """In two minutes vehicles pass stop lines, none of them at red."""
+    """In 80 seconds vehicles pass stop lines, none of them at red."""
     start = middle(place, signalised=True)
     lights = ""
     with SumoCrowd(place.net, place.map, CrowdSpec(persons=0, vehicles=30), 6, OPEN, start[:2]) as crowd:
         lines = StopLines(0.05)
-        for tick in range(2400):
+        for tick in range(1600):
             lights += "".join(p.light for p in lines.passed(crowd.step(at(start), reply(tick)).vehicles.ids))
     assert len(lights) >= 10 and "r" not in lights
 
@@ -234,7 +234,7 @@ def test_signals_change_when_they_say(place: Place) -> None:
 
 
 def test_nobody_passes_a_closed_port(place: Place) -> None:
-    """In a minute and a half nobody goes between a closed sidewalk and its corner, where people pass otherwise."""
+    """In a minute nobody goes between a closed sidewalk and its corner, where people pass otherwise."""
     start = middle(place)
     port = Port(place.map.locate(*start[:2]).edge, 1)
     strip = place.map.strips[port.strip]
@@ -246,7 +246,7 @@ def test_nobody_passes_a_closed_port(place: Place) -> None:
         side: dict[str, str] = {}
         count = 0
         with SumoCrowd(place.net, place.map, spec, 8, closed, start[:2]) as crowd:
-            for tick in range(1800):
+            for tick in range(1200):
                 people = crowd.step(at(start), reply(tick)).people
                 for where, area in (("behind", behind), ("corner", corner)):
                     inside = shapely.contains_xy(area, people.xy[:, 0], people.xy[:, 1])
@@ -274,7 +274,7 @@ def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> 
     spec = CrowdSpec(persons=60, radius_m=60.0, vehicles=0)
     nearest = math.inf
     with SumoCrowd(place.net, place.map, spec, 4, OPEN, start[:2]) as crowd:
-        for tick in range(1200):
+        for tick in range(800):
             walker = acting("a1", start.x_m + 0.01 * tick, start.y_m, 0.0, 0.2)
             street = crowd.step(at(start), reply(tick, talker, walker))
             people = street.people
@@ -284,7 +284,7 @@ def test_event_actors_appear_exactly_and_the_crowd_evades_them(place: Place) -> 
             assert people.xy[-2:].tolist() == [[walker.x_m, walker.y_m], [talker.x_m, talker.y_m]]
             assert people.heading[-1] == 1.0 and people.speed[-2] == 0.2 and people.doing[-2:] == ("walk", "talk")
             nearest = min(nearest, float(gaps(street, ahead)[:-2].min()))
-        street = crowd.step(at(start), reply(1200))
+        street = crowd.step(at(start), reply(800))
         assert street.people.are(PersonKind.CROWD).all()
     assert 0.45 <= nearest < 3.0
 
@@ -304,7 +304,7 @@ def test_the_same_calls_give_the_same_streets_bit_for_bit(place: Place) -> None:
                 streets.append(crowd.step(at(pose), reply(tick, actor)))
         return streets
 
-    first, second, other = run(1, 500), run(1, 500), run(2, 0)
+    first, second, other = run(1, 250), run(1, 250), run(2, 0)
     for a, b in zip(first, second, strict=True):
         assert a.people.ids == b.people.ids and a.people.doing == b.people.doing and a.vehicles.ids == b.vehicles.ids
         assert a.signals == b.signals
@@ -330,7 +330,7 @@ def test_it_survives_a_robot_anywhere(place: Place) -> None:
     bodies = [somewhere() for _ in range(4)]
     spec = CrowdSpec(persons=20, radius_m=60.0, vehicles=8)
     with SumoCrowd(place.net, place.map, spec, 9, OPEN, (bodies[0][0], bodies[0][1])) as crowd:
-        for tick in range(2000):
+        for tick in range(1200):
             for body in bodies:
                 if rng.random() < 0.04:
                     body[:] = somewhere()
@@ -353,12 +353,12 @@ def test_it_survives_corners_that_no_crossing_joins(tmp_path: Path) -> None:
     street_map = read_net(net)
     assert {corner.id for corner in street_map.corners.values()} >= {":j_w0", ":j_w1"}
     rng = np.random.default_rng(4)
-    spots = rng.uniform((-5, -5, -math.pi), (12, 12, math.pi), (2000, 2, 3)).tolist()
+    spots = rng.uniform((-5, -5, -math.pi), (12, 12, math.pi), (1200, 2, 3)).tolist()
     with SumoCrowd(net, street_map, CrowdSpec(persons=4, vehicles=0), 9, OPEN, (0.0, 0.0)) as crowd:
         for tick, (robot, (x, y, heading)) in enumerate(spots):
             actor = acting("e0", x, y, heading, 1.2)
             crowd.step(at(Pose(*robot)), reply(tick, actor))
-        assert crowd.street.tick == 2000
+        assert crowd.street.tick == 1200
 
 
 def test_people_turn_round_where_the_sidewalks_meet(tmp_path: Path) -> None:

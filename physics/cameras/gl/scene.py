@@ -14,9 +14,11 @@ from functools import partial
 from typing import Final
 
 import moderngl
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from cosim.core.baked import Arrays
 from cosim.core.geometry import Floats
 from cosim.core.state import LABELS, Street
 from cosim.spec.obstacle import Obstacle
@@ -31,7 +33,7 @@ from physics.cameras.gl.tiles import ground_layer, ground_rows, tile_shaders
 from physics.cameras.gl.walls import wall_layer, wall_rows, wall_shaders
 from physics.cameras.view import FORGET_M, PROP_MARGIN_M, VISIBLE_M, View
 from physics.street import props
-from physics.street.furniture import KINDS, Prop, parts_of
+from physics.street.furniture import KINDS, parts_of
 from physics.world.mesh import Part
 from physics.world.surface import stood
 from physics.world.tiles import Key, distance_to, distances_within, keys_within, square
@@ -63,6 +65,13 @@ class _Tile:
     seen_m: Floats
     posts: list[props.SignalPost]
     post_z: Floats
+
+
+class _Words(msgspec.Struct, array_like=True):
+    """What of a tile is no array. forms: of its props, for `parts_of`."""
+
+    forms: list[tuple[str, int, int]]
+    posts: list[props.SignalPost]
 
 
 class GlScene:
@@ -189,32 +198,47 @@ class GlScene:
             self._still_for = still
 
     def _built(self, key: Key) -> _Tile:
-        x0, y0, x1, y1 = square(key)
-        middle = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
+        held = self._surface.kept("gl", key, lambda: self._made(key))
+        words = msgspec.msgpack.decode(held["words"].data, type=_Words)
+        pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
+        form = [self._forms.id(("prop", *form), partial(parts_of, *form)) for form in words.forms]
+        things = np.array([*form, *[pole] * len(words.posts)], dtype=np.intp), held["things"]
+        ground, paint, walls = (
+            (held[name], held[f"{name}_triangles"]) if name in held else None for name in ("ground", "paint", "walls")
+        )
+        return _Tile(
+            _middle(key), ground, paint, walls, things, held["thing_xy"], held["seen_m"], words.posts, held["post_z"]
+        )
+
+    def _made(self, key: Key) -> Arrays:
+        """What of a tile hangs on its surface alone."""
+        middle = _middle(key)
         chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
-        ground = ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle)
-        painted = ground_rows(self._surfaces, finish.painted, middle)
-        walls = wall_rows(self._surfaces, chunk.buildings, finish.styles, middle)
+        layers = {
+            "ground": ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle),
+            "paint": ground_rows(self._surfaces, finish.painted, middle),
+            "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
+        }
         post_xy = np.array([(post.x_m, post.y_m) for post in posts]).reshape(-1, 2)
         post_z = self._surface.heights(post_xy)
         furniture = chunk.props
-        form = [self._prop_form(prop) for prop, _ in furniture]
         xyz = np.array([(prop.x_m - middle[0], prop.y_m - middle[1], z) for prop, z in furniture]).reshape(-1, 3)
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in furniture]).reshape(-1, 3)
         rows = instances(xyz, [prop.drawn_rad for prop, _ in furniture], paint, LABELS["prop"])
-        pole = self._forms.id(("signal", "post"), lambda: [Part(props.post_mesh(), props.POLE)])
         headings = [post.heading_rad for post in posts]
         poles = instances(np.column_stack([post_xy - middle, post_z]), headings, props.POLE, LABELS["signal"])
-        things = np.array([*form, *[pole] * len(posts)], dtype=np.intp), np.concatenate([rows, poles])
-        seen_m = np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)])
-        thing_xy = np.concatenate([xyz[:, :2] + middle, post_xy])
-        return _Tile(middle, ground, painted, walls, things, thing_xy, seen_m, posts, post_z)
-
-    def _prop_form(self, prop: Prop) -> int:
-        return self._forms.id(
-            ("prop", *prop.form),
-            lambda: parts_of(*prop.form),
-        )
+        words = msgspec.msgpack.encode(_Words([prop.form for prop, _ in furniture], posts))
+        found = {
+            "words": np.frombuffer(words, dtype=np.uint8),
+            "things": np.concatenate([rows, poles]),
+            "thing_xy": np.concatenate([xyz[:, :2] + middle, post_xy]),
+            "seen_m": np.array([*(KINDS[prop.kind].seen_m for prop, _ in furniture), *[math.inf] * len(posts)]),
+            "post_z": post_z,
+        }
+        for name, layer in layers.items():
+            if layer is not None:
+                found[name], found[f"{name}_triangles"] = layer
+        return found
 
     def _shifted(self, tile: _Tile) -> _Placed:
         form, things = tile.things
@@ -236,7 +260,7 @@ class GlScene:
         standing = stood(obstacles, self._surface)
         if not standing:
             return _NOTHING
-        form = [self._prop_form(prop) for prop, _ in standing]
+        form = [self._forms.id(("prop", *prop.form), partial(parts_of, *prop.form)) for prop, _ in standing]
         paint = np.array([KINDS[prop.kind].paints[prop.paint] for prop, _ in standing])
         xyz = np.array([(0.0, 0.0, z) for _, z in standing])
         rows = instances(xyz, [prop.drawn_rad for prop, _ in standing], paint, LABELS["prop"])
@@ -264,6 +288,12 @@ class GlScene:
         if not forms:
             return _NOTHING
         return np.array(forms), instances(at, heading, paint, LABELS["signal"])
+
+
+def _middle(key: Key) -> Floats:
+    """(2,) of a tile, world metres."""
+    x0, y0, x1, y1 = square(key)
+    return np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1)])
 
 
 def _sector(view: View) -> tuple[int, int | None]:

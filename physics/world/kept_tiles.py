@@ -1,0 +1,112 @@
+"""A tile and what stands in it as arrays, to be kept (`cosim.core.pieces`): what is made again of them is the same to
+the bit."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+import cosim
+import physics
+from cosim.core.baked import Arrays, sources_hash
+from cosim.core.pieces import Pieces
+from cosim.place.street_map import StreetMap
+from cosim.place.terrain import Terrain
+from physics.street.buildings import Building
+from physics.street.furniture import Prop
+from physics.world.mesh import Mesh
+from physics.world.relief import Relief
+from physics.world.tiles import Key, Tile
+
+_ROOMS: Final = (
+    *(Path(cosim.__file__).parent / room for room in ("core", "place")),
+    *(Path(physics.__file__).parent / room for room in ("world", "street", "textures", "cameras/gl")),
+)
+_MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+
+
+class TileThings(msgspec.Struct, frozen=True, array_like=True):
+    """What stands in a tile: buildings on their land, and props."""
+
+    buildings: tuple[Building, ...]
+    props: tuple[Prop, ...]
+
+
+class _Ground(msgspec.Struct, array_like=True):
+    """What of a tile is no array. parts: names, vertices and triangles of its meshes; low, crossings: WKB; relief:
+    roughness and seed."""
+
+    parts: list[tuple[str, int, int]]
+    low: bytes
+    crossings: bytes
+    relief: tuple[float, int] | None
+
+
+def pieces_of(street_map: StreetMap, seed: int, roughness: float) -> Pieces:
+    """What is kept of the tiles of a place."""
+    told = f"{street_map.made_of} {seed} {roughness!r} {_MADE_BY}"
+    return Pieces("tiles", hashlib.sha256(told.encode()).hexdigest()[:32] if street_map.made_of else "")
+
+
+def tile_as_arrays(tile: Tile) -> Arrays:
+    """For `tile_of_arrays`."""
+    meshes, relief = tile.parts.values(), tile.relief
+    words = _Ground(
+        [(name, len(mesh.vertices), len(mesh)) for name, mesh in tile.parts.items()],
+        shapely.to_wkb(tile.low),
+        shapely.to_wkb(tile.crossings),
+        None if relief is None else (relief.roughness, relief.seed),
+    )
+    found = {
+        "words": _as_array(words),
+        "vertices": np.concatenate([mesh.vertices for mesh in meshes]),
+        "normals": np.concatenate([mesh.normals for mesh in meshes]),
+        "triangles": np.concatenate([mesh.triangles for mesh in meshes]),
+    }
+    return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
+
+
+def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
+    """The tile again."""
+    words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
+    parts, corner, triangle = {}, 0, 0
+    for name, corners, triangles in words.parts:
+        here = slice(corner, corner + corners)
+        faces = held["triangles"][triangle : triangle + triangles]
+        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
+        corner, triangle = corner + corners, triangle + triangles
+    low, crossings = shapely.from_wkb([words.low, words.crossings])
+    shapely.prepare([low, crossings])
+    relief = None
+    if words.relief is not None:
+        roughness, seed = words.relief
+        relief = Relief(roughness, seed, held["roots"], held["holes"])
+    return Tile(key, parts, low, crossings, relief, terrain)
+
+
+def things_as_arrays(things: TileThings) -> Arrays:
+    """For `things_of_arrays`."""
+    return {"words": _as_array(things)}
+
+
+def things_of_arrays(held: Arrays) -> TileThings:
+    """The things again."""
+    return msgspec.msgpack.decode(held["words"].data, type=TileThings, dec_hook=_geometry)
+
+
+def _as_array(words: msgspec.Struct) -> NDArray[np.uint8]:
+    return np.frombuffer(msgspec.msgpack.encode(words, enc_hook=_plain), dtype=np.uint8)
+
+
+def _plain(value: Any) -> Any:
+    return shapely.to_wkb(value) if isinstance(value, shapely.Geometry) else value.item()
+
+
+def _geometry(_: type, wkb: Any) -> Any:
+    return shapely.from_wkb(wkb)

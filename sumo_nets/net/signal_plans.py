@@ -1,0 +1,76 @@
+"""Signal plans: what the crossings' signals of a net show at any time, where fixed programs decide it alone.
+
+A plan is made only of a program that SUMO runs by the clock, whose elements are all known here and whose times are
+whole steps, which SUMO rounds to; everything else is left to SUMO.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+from cosim.core.clock import Clock
+from cosim.place.street_map import SignalPlan
+
+_LOGIC: Final = frozenset(("id", "type", "programID", "offset"))
+_PHASE: Final = frozenset(("duration", "state", "name"))
+_SECONDS: Final = re.compile(r"(-?\d{1,9})(?:\.(\d{1,3}))?")
+_WALK: Final = "Gg"
+_OFF: Final = "off"
+
+
+@dataclass(slots=True)
+class SignalPrograms:
+    """What a net says of its traffic lights, element by element. others: whether it also says when programs change."""
+
+    logics: list[Mapping[str, str]] = field(default_factory=list)
+    phases: list[list[Mapping[str, str]]] = field(default_factory=list)
+    plain: list[bool] = field(default_factory=list)
+    others: bool = False
+
+    def add(self, tag: str, parent: str, attributes: Mapping[str, str]) -> None:
+        """The next element of the net, and what it stands in."""
+        if tag == "tlLogic":
+            self.logics.append(attributes)
+            self.phases.append([])
+            self.plain.append(attributes.keys() <= _LOGIC)
+        elif parent == "tlLogic" and tag == "phase":
+            self.phases[-1].append(attributes)
+        elif parent == "tlLogic":
+            self.plain[-1] = False
+        elif tag.startswith("WAUT"):
+            self.others = True
+
+    def plans(self, links: Sequence[Mapping[str, str]], crossings: Iterable[str]) -> dict[str, SignalPlan]:
+        """The plans of those crossings that have one. links: the connections to them."""
+        names = [logic.get("id", "") for logic in self.logics]
+        often = Counter(names)
+        fixed = {} if self.others else {name: k for k, name in enumerate(names) if often[name] == 1}
+        wanted, first = frozenset(crossings), dict[str, tuple[str, int]]()
+        for link in links:
+            if (to := link.get("to", "")) in wanted and "tl" in link:
+                index = link.get("linkIndex", "")
+                controlled = link["tl"], int(index) if index.isdecimal() else -1
+                first[to] = min(first.get(to, controlled), controlled)
+        plans = {to: self._plan(fixed[light], index) for to, (light, index) in first.items() if light in fixed}
+        return {to: plan for to, plan in plans.items() if plan is not None}
+
+    def _plan(self, k: int, index: int) -> SignalPlan | None:
+        logic, phases = self.logics[k], self.phases[k]
+        offset_ms = _ms(logic.get("offset", "0"))
+        durations_ms = [ms for phase in phases if (ms := _ms(phase.get("duration", "")))]
+        plain = self.plain[k] and logic.get("type") == "static" and logic.get("programID") != _OFF
+        plain = plain and all(phase.keys() <= _PHASE and 0 <= index < len(phase.get("state", "")) for phase in phases)
+        if not plain or not phases or offset_ms is None or len(durations_ms) < len(phases):
+            return None
+        return SignalPlan(offset_ms, tuple(durations_ms), tuple(phase["state"][index] in _WALK for phase in phases))
+
+
+def _ms(seconds: str) -> int | None:
+    """Milliseconds, SUMO's own unit; None for what is no plain number or no whole steps."""
+    found = _SECONDS.fullmatch(seconds)
+    ms = int(found[1] + (found[2] or "").ljust(3, "0")) if found is not None else 1
+    return ms if ms % Clock().tick_ms == 0 else None
