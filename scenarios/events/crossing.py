@@ -1,6 +1,6 @@
 """`ped_crossing`: people cross from the far side and from behind when the robot enters the crosswalk.
 
-The first comes from the front, at the robot until it commits to its line; every second one comes from behind.
+The first comes from the front, in the middle or on the robot's line; every second one comes from behind.
 """
 
 from __future__ import annotations
@@ -13,14 +13,17 @@ import numpy as np
 from cosim.spec.event_kind import EventKind
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import aimed, along_m, edge_m, gave_up, pressed_on, walked_on, walker_at
+from scenarios.events.walking import along_m, edge_m, gave_up, left_m, met_m, pressed_on, walked_on, walker_at
 
 _BEFORE_M: Final = 0.8
 """How far before its end of the crosswalk each one waits, and behind its other end it is done."""
 BEHIND_ROBOT_M: Final = 1.6
 """Those from behind wait this much farther back: the robot has just passed them."""
-COMMITS_TO_LINE_M: Final = 3.0
-"""So near to the robot the first one keeps its line."""
+MEETS_AMONG: Final = 2
+"""Among so few the first one walks on the robot's line wherever that is, else in the middle: who keeps to a side meets
+one of the others there."""
+TO_LINE_M: Final = 1.5
+"""It walks towards the point of its line so far ahead."""
 _ABREAST_M: Final = 0.75
 """Between the lines of two who walk the same way."""
 
@@ -50,8 +53,10 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker, sight = state.walkers[number], sight_of(event, number, query)
     heading_rad = event.heading_rad + (math.pi if from_front(number) else 0.0)
     if from_front(number) and not gave_up(walker, query) and not _passed(event, walker, query):
-        if number == 0 and not sight.robot_stands:
-            walker, heading_rad = aimed(walker, query, COMMITS_TO_LINE_M)
+        if number == 0:
+            room_m = edge_m(event) if event.people <= MEETS_AMONG else 0.0
+            off_m = left_m(event, walker.x_m, walker.y_m) - met_m(state.lane_m, room_m)
+            heading_rad += math.atan2(off_m, TO_LINE_M)
         return pressed_on(walker, heading_rad, event.speed_mps, sight)
     if _across(event, walker, number):
         return walker

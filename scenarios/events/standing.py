@@ -21,7 +21,7 @@ from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
-from scenarios.events.walking import along_m, edge_m, spot, turned, walked_to, walker_at
+from scenarios.events.walking import ON_THE_MIDDLE_M, along_m, edge_m, met_m, spot, turned, walked_to, walker_at
 
 _TRIGGER_M: Final = 10.0
 LOOK_PERIOD_S: Final = 4.0
@@ -36,8 +36,6 @@ GROUP_M: Final = 1.95
 """Half the width of a sidewalk on which one can pass round a group of talkers in its middle."""
 WAITING_M: Final = 0.8
 """From one to the next of those who wait at the edge."""
-ON_THE_MIDDLE_M: Final = 0.3
-"""A robot no farther from the middle of the sidewalk is met there."""
 PASSED_BY_M: Final = 3.0
 """So far beyond the last of them along the route the robot has passed them."""
 
@@ -50,16 +48,11 @@ _Facing = Callable[[Event, Walker, EventQuery, EventState], float]
 _PASSABLE: Final = SidewalkLayout((18.0, 20.0), (11.0, 13.0))
 
 
-def _lane(lane_m: float, room_m: float) -> float:
-    """How far left of the middle of the sidewalk a robot is met that was `lane_m` left of it."""
-    return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > ON_THE_MIDDLE_M else 0.0
-
-
 def talking_places(event: Event, lane_m: float) -> tuple[_Place, ...]:
     """Evenly on a circle, two of them abreast of the robot's way."""
     radius_m = TALK_M * (1.15 if event.people == 4 else 1.0)
     angles = [math.pi / 2 + 2.0 * math.pi * k / event.people for k in range(event.people)]
-    left_m = _lane(lane_m, max(edge_m(event) - radius_m, 0.0))
+    left_m = met_m(lane_m, max(edge_m(event) - radius_m, 0.0))
     return tuple((radius_m * math.cos(a), left_m + radius_m * math.sin(a)) for a in angles)
 
 
@@ -76,7 +69,7 @@ def _queue_side(event: Event, lane_m: float) -> float:
 
 def in_the_way(event: Event, lane_m: float) -> tuple[_Place, ...]:
     """One person."""
-    return ((0.0, _lane(lane_m, edge_m(event))),)
+    return ((0.0, met_m(lane_m, edge_m(event))),)
 
 
 def _aside(event: Event, number: int) -> _Place:

@@ -16,6 +16,8 @@ from scenarios.events.sight import Sight, led_round, place_taken
 
 EDGE_GAP_M = 0.1
 TURN_RADPS = math.pi
+ON_THE_MIDDLE_M = 0.3
+"""A robot no farther from the middle of the way is met there."""
 SLOW_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
 _GIVES_UP_S = 2.0
@@ -47,6 +49,12 @@ def left_m(event: Event, x_m: float, y_m: float) -> float:
 def edge_m(event: Event) -> float:
     """How far from the middle one can stand with both shoulders on the sidewalk."""
     return max(event.half_width_m - PERSON_RADIUS_M - EDGE_GAP_M, 0.0)
+
+
+def met_m(lane_m: float, room_m: float) -> float:
+    """How far left of the middle of the way a robot is met that was `lane_m` left of it at the trigger, with so much
+    room to either side."""
+    return max(-room_m, min(room_m, lane_m)) if abs(lane_m) > ON_THE_MIDDLE_M else 0.0
 
 
 def robot_of(query: EventQuery) -> RobotBody:

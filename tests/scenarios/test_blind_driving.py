@@ -102,6 +102,14 @@ def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(kind: s
     assert near.state.walkers[0].y_m == middle.state.walkers[0].y_m
 
 
+@pytest.mark.parametrize("left_m", [-0.9, -0.6, 0.6, 0.9])
+@pytest.mark.parametrize("people", [1, 2, 3, 4])
+def test_who_keeps_to_one_side_of_a_crosswalk_meets_somebody(people: int, left_m: float) -> None:
+    """Who comes from the front, or who waits to follow from behind."""
+    for side in (-1, 1):
+        assert drive(event("ped_crossing", 1.6, people, side), lambda _: 1.2, 40.0, 20.0, left_m).gap_m < 0.0
+
+
 @pytest.mark.parametrize("kind", STANDING)
 def test_those_who_stand_stay_until_the_robot_is_three_metres_past_the_last_of_them(kind: str) -> None:
     """However long it takes: beside them it creeps past at 0.06 m/s, and they do not stir before."""
