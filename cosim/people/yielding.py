@@ -38,11 +38,15 @@ def outline_mps(v_mps: float, w_radps: float, half_m: tuple[float, float]) -> fl
 
 
 class RobotBody(NamedTuple):
-    """The robot as people see it: its pose, half its length and width in metres, its speed."""
+    """The robot as people see it, or what stands: its pose, half its length and width in metres, its speed.
+
+    closed: unit vector to the side on which nobody can pass it; (0, 0) where one can on either.
+    """
 
     pose: Pose
     half_m: tuple[float, float]
     v_mps: float = 0.0
+    closed: tuple[float, float] = (0.0, 0.0)
 
 
 def within_reach_m(body: RobotBody) -> float:
@@ -76,6 +80,11 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
     step = near - local
     pace = np.hypot(step[:, 0], step[:, 1])
     side = np.where(local[:, 0] * step[:, 1] - local[:, 1] * step[:, 0] >= 0.0, 1.0, -1.0)
+
+    if body.closed != (0.0, 0.0):
+        shut = np.array(body.closed) @ turn
+        to_left = step[:, 0] * shut[1] - step[:, 1] * shut[0]
+        side = np.where(to_left == 0.0, side, np.where(to_left > 0.0, 1.0, -1.0))
 
     out = local - np.clip(local, low, high)
     far = np.hypot(out[:, 0], out[:, 1])

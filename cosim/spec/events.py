@@ -122,11 +122,24 @@ class NearbyPerson(msgspec.Struct, frozen=True, array_like=True):
     kind: PersonKind = PersonKind.CROWD
 
 
+class StandingBody(msgspec.Struct, frozen=True, array_like=True):
+    """What stands in the way of people: a rectangle, length_m along its heading. closed_x, closed_y: unit vector to the
+    side on which nobody can pass it, (0, 0) where one can on either."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    length_m: float
+    width_m: float
+    closed_x: float = 0.0
+    closed_y: float = 0.0
+
+
 class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     """What the simulator sends at each tick. states: one per event, empty at the first tick.
 
     route_s_m: the robot's arc length on the reference route. robot_length_m, robot_width_m: its outline.
-    nearby: who is near the people that the director moves, see `cosim.people.neighbours`.
+    nearby: who is near the people that the director moves, see `cosim.people.neighbours`. standing: what stands there.
     """
 
     episode: str
@@ -143,6 +156,7 @@ class EventQuery(msgspec.Struct, frozen=True, kw_only=True):
     events: tuple[Event, ...]
     states: tuple[EventState, ...] = ()
     nearby: tuple[NearbyPerson, ...] = ()
+    standing: tuple[StandingBody, ...] = ()
 
 
 class EventReply(msgspec.Struct, frozen=True, kw_only=True):

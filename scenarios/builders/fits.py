@@ -12,6 +12,7 @@ from shapely.geometry import LineString, Point
 from cosim.core.errors import MapError, SpecError, UsageError
 from cosim.core.telling import Tell, untold
 from cosim.place.street_map import StreetMap, WalkableArea
+from cosim.spec.obstacle import footprint
 from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
 from cosim.spec.spec_file import in_lines
@@ -69,6 +70,7 @@ def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[st
             *_off(scenario, area),
             *_odd_crossings(scenario, street_map),
             *_odd_barriers(scenario, street_map),
+            *_odd_obstacles(scenario, area),
             *_crowded(scenario, street_map),
         )
         yield from (f"scenario '{scenario.id}': {fault}" for fault in told)
@@ -117,6 +119,21 @@ def _odd_barriers(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
             yield f"barriers[{number}] stands {far_m:.0f} m from strip '{barrier.strip}', which it should close"
         elif fence.distance(route) < half_width_m:
             yield f"barriers[{number}] on strip '{barrier.strip}' stands across the route"
+
+
+def _odd_obstacles(scenario: Scenario, area: WalkableArea) -> Iterator[str]:
+    """Obstacles that stand where nobody walks, where the robot starts, or on the goal."""
+    start, goal = Point(scenario.start[:2]), Point(scenario.goal)
+    robot = ROBOTS.get(scenario.robot)
+    reach_m = 0.0 if robot is None else float(np.hypot(*robot.footprint_m)) / 2
+    for number, obstacle in enumerate(scenario.obstacles):
+        ground, at = footprint(obstacle), f"obstacles[{number}] ({obstacle.kind})"
+        if area.signed_distance([obstacle.x_m, obstacle.y_m])[0] < -_EDGE_M:
+            yield f"{at} is off the walkable area at ({obstacle.x_m:.2f}, {obstacle.y_m:.2f})"
+        elif ground.distance(start) < reach_m:
+            yield f"{at} stands where the robot starts"
+        elif ground.covers(goal):
+            yield f"{at} stands on the goal"
 
 
 def _odd_events(scenarios: Iterable[Scenario]) -> Iterator[str]:

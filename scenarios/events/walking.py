@@ -9,6 +9,7 @@ import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
+from cosim.people.standing import seen
 from cosim.people.steering import Vector
 from cosim.people.yielding import RobotBody, stepped_round, touches, within_reach_m
 from cosim.spec.events import Event, EventQuery, Walker
@@ -20,6 +21,7 @@ ON_THE_MIDDLE_M = 0.3
 """A robot no farther from the middle of the way is met there."""
 SLOW_MPS = 0.3
 """Below this the motion says nothing about where somebody faces."""
+_SAME_M = 1e-9
 _GIVES_UP_S = 2.0
 """How long somebody stands against a robot that it has run into before it goes round."""
 
@@ -102,8 +104,8 @@ def stepped(
     *,
     insisting: bool = False,
 ) -> Walker:
-    """The walker one step on, with the step led round people, then round the robot."""
-    led = led_round(walker, wanted, sight, goal, insisting=insisting)
+    """The walker one step on, with the step led round people, then round what stands there, then round the robot."""
+    led = _round_things(walker, led_round(walker, wanted, sight, goal, insisting=insisting), sight.query)
     if led != wanted:
         heading_rad = facing(walker, led, sight)
     x_m, y_m = led
@@ -111,6 +113,17 @@ def stepped(
     if math.dist(led, robot.pose[:2]) < within_reach_m(robot):
         x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([led]), robot)[0].tolist()
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=heading_rad)
+
+
+def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
+    """Where a step ends that should end at `wanted` (m), once it is led round what stands there; `wanted` itself where
+    it is not."""
+    for thing in query.standing:
+        body = seen(thing)
+        if math.dist(wanted, body.pose[:2]) < within_reach_m(body):
+            x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([wanted]), body)[0].tolist()
+            wanted = wanted if math.dist(wanted, (x_m, y_m)) < _SAME_M else (x_m, y_m)
+    return wanted
 
 
 def facing(walker: Walker, after: Vector, sight: Sight) -> float:
@@ -142,7 +155,7 @@ def pressed_on(walker: Walker, heading_rad: float, speed_mps: float, sight: Sigh
         return msgspec.structs.replace(walker, blocked_ticks=walker.blocked_ticks + 1)
     step_m = speed_mps * sight.query.tick_ms / 1000
     wanted = (walker.x_m + math.cos(heading_rad) * step_m, walker.y_m + math.sin(heading_rad) * step_m)
-    x_m, y_m = led = led_round(walker, wanted, sight)
+    x_m, y_m = led = _round_things(walker, led_round(walker, wanted, sight), sight.query)
     if led == wanted:
         return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=wrap_angle(heading_rad))
     return msgspec.structs.replace(walker, x_m=x_m, y_m=y_m, heading_rad=facing(walker, led, sight), aim_rad=None)

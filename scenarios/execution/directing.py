@@ -11,23 +11,30 @@ import ast
 import hashlib
 import importlib.util
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from functools import cache, partial
 from pathlib import Path
 from typing import Final
+
+import msgspec
 
 import scenarios.events
 from bridge import keys
 from bridge.director import RemoteDirector, Waiting, serve_director
 from bridge.session import LoneSession, Session
 from cosim.core.errors import DirectorLost, EngineError
+from cosim.core.state import DIRECTED, People
 from cosim.episode.ports import Director
+from cosim.people.standing import Standing
 from cosim.spec.event_kind import EventKinds
+from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.options import Outside
 from scenarios.events import EVENT_KINDS, react
 
 RETRY_S: Final = 0.2
+_NEAR_M: Final = 0.5
+"""Of what stands there directors are told so much before people reach it."""
 _OURS: Final = ("cosim.", "scenarios.")
 
 
@@ -53,6 +60,19 @@ def directed_by(outside: Outside, waiting: Waiting, episode: str) -> Iterator[Di
     with _reached(outside, waiting) as session:
         key = keys.director(outside.run, keys.chunk(episode))
         yield RemoteDirector(session, key, by=behaviours(), wait_s=outside.wait_s, waiting=waiting)
+
+
+class AmongObstacles:
+    """A director that is told what stands near the people whom it moves. people: those on the street now."""
+
+    def __init__(self, director: Director, standing: Standing, people: Callable[[], People]) -> None:
+        self._director, self._standing, self._people = director, standing, people
+
+    def react(self, query: EventQuery) -> EventReply:
+        """The director's reply, the obstacles being known."""
+        people = self._people()
+        near = self._standing.near(people.xy[people.are(*DIRECTED)], _NEAR_M)
+        return self._director.react(msgspec.structs.replace(query, standing=near) if near else query)
 
 
 def serve(session: Session) -> None:

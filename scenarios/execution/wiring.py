@@ -15,7 +15,8 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.episode.loop import Moment, Parts
-from cosim.episode.ports import Camera, CameraSpec, Eyes, Manifest, Privileged
+from cosim.episode.ports import Camera, CameraSpec, Director, Eyes, Manifest, Privileged
+from cosim.people.standing import Standing, standing_bodies
 from cosim.place import overlay
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
@@ -30,7 +31,7 @@ from physics.street.furniture import Prop, footprints
 from physics.world.surface import Surface
 from physics.world.world import BulletWorld
 from scenarios.builders.barriers import fenced
-from scenarios.execution.directing import director_of
+from scenarios.execution.directing import AmongObstacles, director_of
 from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place, surface_of_place
 from scenarios.execution.scorer import Scorer
@@ -43,6 +44,9 @@ if TYPE_CHECKING:
 
 CORRIDOR_M = 40.0
 """The walkable area is judged this far around the route; beyond it everything is out of lane."""
+
+_BESIDE_M = 10.0
+"""The walkable ground is looked at so far around obstacles."""
 
 FRONTAGE_M = 2.0
 """Beside a sidewalk there is room for this much."""
@@ -103,6 +107,9 @@ def staged(
 
             director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
         injected = InjectedPeople(director, clock.tick_ms, partial(on_map, street_map), options.injections)
+        directed: Director = injected
+        if scenario.obstacles:
+            directed = AmongObstacles(injected, standing_in(scenario, street_map), lambda: crowd.street.people)
 
         @cache
         def free() -> Polygon | MultiPolygon:
@@ -113,7 +120,7 @@ def staged(
             return room
 
         yield StagedScenario(
-            parts=Parts(world, crowd, injected, camera),
+            parts=Parts(world, crowd, directed, camera),
             robot=robot,
             renderer=renderer,
             scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock),
@@ -140,7 +147,18 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
     from sumo_nets.crowd.crowd import SumoCrowd  # with SUMO
 
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-    return SumoCrowd(net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, robot.footprint_m, before)
+    return SumoCrowd(
+        net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, robot.footprint_m, before,
+        standing_in(scenario, street_map),
+    )  # fmt: skip
+
+
+def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:
+    """The obstacles of a scenario as people see them."""
+    if not scenario.obstacles:
+        return Standing()
+    around = shapely.union_all([footprint(one, _BESIDE_M) for one in scenario.obstacles])
+    return standing_bodies(scenario.obstacles, street_map.walkable_near(around))
 
 
 def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Privileged:

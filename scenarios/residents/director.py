@@ -61,7 +61,7 @@ def among_residents(
     count = scenario.crowd.residents
     if not count:
         return director
-    graph = behavior_graph(street_map, ground, scenario.route, scenario.barriers)
+    graph = behavior_graph(street_map, ground, scenario.route, scenario.barriers, scenario.obstacles)
     return Residents(director, graph, count, scenario.seed, people)
 
 

@@ -1,7 +1,8 @@
 """The behaviour graph of a street: waypoints on its sidewalks, and places where there is something to do.
 
-A pure function of the place, its seed, the route and its barriers. Ways keep to the sidewalks and corners near the
-route, never lead over a road or a crossing, and are clear of everything that stands there by a person's radius.
+A pure function of the place, its seed, the route, its barriers and obstacles. Ways keep to the sidewalks and corners
+near the route, never lead over a road or a crossing, and are clear of everything that stands there by a person's
+radius.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place import overlay
 from cosim.place.street_map import Corner, Lane, StreetMap, Strip, union_closed
+from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.scenario import Barrier
 from physics.street.furniture import footprints
 from physics.street.interaction_spots import InteractionSpot, What, spots
@@ -128,7 +130,11 @@ class BehaviorGraph:
 
 
 def behavior_graph(
-    street_map: StreetMap, ground: StreetSurface, route: Sequence[tuple[float, float]], barriers: Sequence[Barrier] = ()
+    street_map: StreetMap,
+    ground: StreetSurface,
+    route: Sequence[tuple[float, float]],
+    barriers: Sequence[Barrier] = (),
+    obstacles: Sequence[Obstacle] = (),
 ) -> BehaviorGraph:
     """The graph of the streets around a route."""
     area = shapely.buffer(LineString(route), _REACH_M)
@@ -143,7 +149,7 @@ def behavior_graph(
     buildings = [b for i in range(i0, i1 + 1) for j in range(j0, j1 + 1) for b in ground.buildings((i, j))]
     lanes = [lane for lane in street_map.near("lane", area) if isinstance(lane, Lane)]
     roads = [lane.polygon for lane in lanes if lane.kind == "road"]
-    things = [*footprints(props), *(b.polygon for b in buildings), *(outline(barrier) for barrier in barriers)]
+    things = [*footprints(props), *(b.polygon for b in buildings), *map(outline, barriers), *map(footprint, obstacles)]
     walk = union_closed([s.polygon for s in strips] + [c.polygon for c in corners]) if strips else shapely.Polygon()
     blocked = overlay.union_all(_grown(things, PERSON_RADIUS_M + _GAP_M) + _grown(roads, PERSON_RADIUS_M))
     open_ground = overlay.difference(shapely.buffer(walk, OFF_WALK_M, quad_segs=4), blocked)

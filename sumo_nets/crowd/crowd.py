@@ -26,6 +26,7 @@ from cosim.core.state import (
     write_protected,
 )
 from cosim.episode.ports import Crowd
+from cosim.people.standing import Standing
 from cosim.people.yielding import RobotBody
 from cosim.place.street_map import Port, StreetMap
 from cosim.spec.events import Actor, EventReply
@@ -59,6 +60,7 @@ class SumoCrowd(Crowd):
 
     closed: ports where barriers stand; background walkers never pass them. start_xy: where the robot starts, metres.
     footprint_m: its length and width. before: who entered and left a street like this one, to be let in and out again.
+    standing: what people step round besides the robot.
     Everything random comes from `seed`: the same calls give the same streets, bit for bit. Use as a context manager.
     entrances: who has come and gone since it was entered.
     """
@@ -76,11 +78,13 @@ class SumoCrowd(Crowd):
         start_xy: tuple[float, float],
         footprint_m: tuple[float, float] = COURIER.footprint_m,
         before: Entrances | None = None,
+        standing: Standing | None = None,
     ) -> None:
         self._net_path, self._map, self._spec, self._seed = net_path, street_map, spec, seed
         self._closed, self._start_xy = closed, start_xy
         self._half_m = (footprint_m[0] / 2, footprint_m[1] / 2)
         self._before = before
+        self._standing = Standing() if standing is None else standing
         self._street: Street | None = None
 
     def __enter__(self) -> Self:
@@ -167,7 +171,7 @@ class SumoCrowd(Crowd):
         self._serial: Iterator[int] = count()
         self._robot = Proxy(sumo, self._walks, base="r", kind="robot", serial=self._serial)
         self._actors: dict[str, Proxy] = {}
-        self._poses = PoseFilter(TICK_MS / 1000)
+        self._poses = PoseFilter(TICK_MS / 1000, self._standing)
         self._shown = ShownPeople(TICK_MS / 1000)
         self._sized = NO_VEHICLES.ids, NO_VEHICLES.size
         if self._spec.vehicles:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.rows import RowLookup
+from cosim.people.standing import Standing
 from cosim.people.yielding import RobotBody, stepped_round
 from sumo_nets.crowd.separation import NearPairs, kept_apart
 
@@ -39,9 +40,11 @@ NOBODY_ELSE: Floats = np.zeros((0, 2))
 
 @dataclass(slots=True)
 class PoseFilter:
-    """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on."""
+    """Remembers the shown poses of everybody; `update` moves them one period of `period_s` on. standing: what people
+    step round besides the robot."""
 
     period_s: float
+    standing: Standing = field(default_factory=Standing)
     _rows: RowLookup = field(default_factory=RowLookup)
     _xy: Floats = field(default_factory=lambda: np.zeros((1, 2)))
     _heading: Floats = field(default_factory=lambda: np.zeros(1))
@@ -78,6 +81,7 @@ class PoseFilter:
         shown = self._apart(before, shown, others, stand)
         if body is not None:
             shown = stepped_round(before, shown, body, stand)
+        shown = self.standing.stepped_round(before, shown, stand)
         velocity = (shown - before) / self.period_s
         velocity[new] = simulated
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)

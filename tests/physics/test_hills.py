@@ -143,7 +143,7 @@ def test_an_episode_on_the_hill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     (whole,) = suite_on_map("long-horizon", "hill", 3, 1).scenarios
     way = whole.route[:66]
     scenario = msgspec.structs.replace(
-        whole, route=way, goal=way[-1], events=(), crowd=CrowdSpec(persons=6, vehicles=2)
+        whole, route=way, goal=way[-1], events=(), obstacles=(), crowd=CrowdSpec(persons=6, vehicles=2)
     )
     heights = street_map.terrain.height(np.array(way))
     top = int(heights.argmax())

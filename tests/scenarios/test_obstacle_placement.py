@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import msgspec
@@ -11,11 +12,13 @@ import shapely
 from shapely.geometry import LineString, Point
 
 from cosim.core.errors import SpecError
+from cosim.core.state import PERSON_RADIUS_M, RobotState
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import EventReply
 from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
 from cosim.spec.robot import COURIER
-from cosim.spec.scenario import City, Scenario
+from cosim.spec.scenario import City, CrowdSpec, Scenario
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
 from physics.world.street_surface import StreetSurface
@@ -177,3 +180,39 @@ def _thinner(strip):  # type: ignore[no-untyped-def]
 
     polygon = shapely.buffer(LineString(strip.line), 0.5, cap_style="flat")
     return dataclasses.replace(strip, width_m=1.0, polygon=polygon)
+
+
+@pytest.mark.engine
+def test_people_go_round_what_is_put_in_their_way() -> None:
+    """Two seconds of a crowd: where somebody walked without obstacles, nobody does once bins stand there."""
+    from scenarios.execution.wiring import crowd_of
+
+    def tracks(one: Scenario) -> dict[str, list[tuple[float, float]]]:
+        found: dict[str, list[tuple[float, float]]] = {}
+        reply = EventReply(episode="t", tick=0, states=(), actors=())
+        with crowd_of(one) as crowd:
+            for _ in range(40):
+                people = crowd.step(RobotState(one.start_pose), reply).people
+                for name, (x_m, y_m) in zip(people.ids, people.xy.tolist(), strict=True):
+                    found.setdefault(name, []).append((x_m, y_m))
+        return found
+
+    bare = msgspec.structs.replace(ways()[0], obstacles=(), crowd=CrowdSpec(persons=25, vehicles=0))
+    before = tracks(bare)
+    inside = shapely.buffer(street().walkable, -0.8)
+    spots: list[tuple[float, float]] = []
+    for track in before.values():
+        walks, at = len(track) == 40 and math.dist(track[0], track[-1]) > 2.0, track[min(24, len(track) - 1)]
+        if walks and shapely.contains_xy(inside, *at) and all(math.dist(at, other) > 4.0 for other in spots):
+            spots.append(at)
+    bins = tuple(Obstacle(kind="bin", x_m=x, y_m=y, heading_rad=0.0) for x, y in spots)
+    after = tracks(msgspec.structs.replace(bare, obstacles=bins))
+    ground = shapely.union_all([footprint(one) for one in bins])
+
+    def nearest_m(found: dict[str, list[tuple[float, float]]]) -> float:
+        late = [at for track in found.values() for at in track if len(track) == 40]
+        free = [at for at in late if at not in {track[0] for track in found.values()}]
+        return float(shapely.distance(shapely.points(free), ground).min())
+
+    assert len(bins) >= 3 and nearest_m(before) == 0.0
+    assert nearest_m(after) > PERSON_RADIUS_M - 0.05

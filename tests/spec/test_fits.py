@@ -13,6 +13,7 @@ from shapely.geometry import LineString, box
 from cosim.core.errors import SpecError
 from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.spec.events import Event
+from cosim.spec.obstacle import Obstacle
 from cosim.spec.scenario import Barrier, City, CrowdSpec, Light, RouteCrossing, Scenario, Suite
 from scenarios.builders import fits
 from scenarios.builders.fits import check_places, misfits
@@ -39,6 +40,10 @@ def event(**changes: Any) -> Event:
 def barrier(**changes: Any) -> Barrier:
     at: dict[str, Any] = {"x_m": 0.0, "y_m": 3.0, "heading_rad": 1.5708, "length_m": 3.4, "strip": "north", "end": 0}
     return Barrier(**at | changes)
+
+
+def a_bin(**at: float) -> Obstacle:
+    return Obstacle(kind="bin", heading_rad=0.0, **at)
 
 
 def from_west_to_east(**changes: Any) -> Scenario:
@@ -92,10 +97,16 @@ def test_what_fits_is_not_spoken_of() -> None:
             {"crossings": (RouteCrossing(id="east", enter_s_m=2.0, leave_s_m=20.0, signalised=True),)},
             "crossing 'east' is not where the route is from enter_s_m to leave_s_m",
         ),
+        (
+            {"obstacles": (a_bin(x_m=-15.0, y_m=1.0), a_bin(x_m=-15.0, y_m=2.5))},
+            "obstacles[1] (bin) is off the walkable area at (-15.00, 2.50)",
+        ),
+        ({"obstacles": (a_bin(x_m=-29.4, y_m=0.3),)}, "obstacles[0] (bin) stands where the robot starts"),
+        ({"obstacles": (a_bin(x_m=29.9, y_m=0.0),)}, "obstacles[0] (bin) stands on the goal"),
     ],
     ids=[
         "start-off", "route-off", "event-off", "unknown-strip", "far-barrier", "barrier-across", "no-crossing",
-        "other-signal", "crossing-elsewhere",
+        "other-signal", "crossing-elsewhere", "obstacle-off", "obstacle-at-start", "obstacle-on-goal",
     ],
 )  # fmt: skip
 def test_what_does_not_fit_is_named_with_its_place(changes: dict[str, Any], told: str) -> None:

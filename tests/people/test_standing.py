@@ -1,0 +1,116 @@
+"""Nobody walks through what stands there: the shown crowd, people of events and injected ones step round it."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import Polygon, box
+
+from cosim.core.geometry import Floats
+from cosim.core.state import PERSON_RADIUS_M
+from cosim.people.standing import Standing, standing_bodies
+from cosim.spec.events import EventQuery, Walker
+from cosim.spec.obstacle import OBSTACLE_SIZES_M, Obstacle, footprint
+from scenarios.events.sight import Sight
+from scenarios.events.walking import pressed_on, walked_on
+from sumo_nets.crowd.pose_filter import PoseFilter
+
+DT_S = 0.05
+SIDEWALK = box(-20.0, -1.6, 20.0, 1.6)
+TOUCHES_M = 0.02
+
+
+def standing(*obstacles: Obstacle, area: Polygon = SIDEWALK) -> Standing:
+    return standing_bodies(obstacles, area)
+
+
+def thing(kind: str, x_m: float = 0.0, y_m: float = 0.0, heading_rad: float = 0.3, form: int = 2) -> Obstacle:
+    return Obstacle(kind=kind, x_m=x_m, y_m=y_m, heading_rad=heading_rad, form=form)
+
+
+def shown(things: Standing, y_m: float, east: bool, seconds: float = 9.0) -> Floats:
+    """(T, 2) where somebody is shown whom SUMO walks along x at y_m, straight through everything."""
+    poses = PoseFilter(DT_S, things)
+    x = np.arange(-5.0, -5.0 + 1.3 * seconds, 1.3 * DT_S) * (1 if east else -1)
+    rows = [
+        poses.update(("c1",), np.array([[at, y_m]]), np.array([1.3]), lambda _: 0.0 if east else math.pi)[0][0]
+        for at in x.tolist()
+    ]
+    return np.array(rows)
+
+
+def gap_m(track: Floats, *obstacles: Obstacle) -> float:
+    """Least distance of the disk on a track from what stands there."""
+    ground = shapely.union_all([footprint(one) for one in obstacles])
+    return float(shapely.distance(shapely.points(track), ground).min()) - PERSON_RADIUS_M
+
+
+@pytest.mark.parametrize("kind", sorted(OBSTACLE_SIZES_M))
+def test_the_crowd_steps_round_what_stands_in_its_way(kind: str) -> None:
+    """From either side, wherever on it they are headed, people go round and come to where they would be."""
+    one = thing(kind)
+    for y_m in (-0.5, -0.1, 0.0, 0.3):
+        for east in (True, False):
+            track = shown(standing(one), y_m, east)
+            assert gap_m(track, one) > -TOUCHES_M
+            assert track[-1] == pytest.approx([6.6 if east else -6.6, y_m], abs=0.1)
+            assert np.hypot(*np.diff(track, axis=0).T).max() <= 0.12
+    through = shown(Standing(), 0.0, True)
+    assert gap_m(through, one) < -0.2
+
+
+def test_what_reaches_to_the_edge_is_passed_on_the_other_side() -> None:
+    """Beside a wall people pass a row of bins on the side where there is room, and stay on the sidewalk."""
+    row = [thing("bin", 0.75 * k, 1.15, 1.57) for k in range(3)]
+    things = standing(*row)
+    (body,) = things.bodies
+    assert (body.closed_x, body.closed_y) == pytest.approx((0.0, 1.0), abs=0.05)
+    for east in (True, False):
+        for y_m in (1.2, 1.0, 0.7):
+            track = shown(things, y_m, east)
+            assert gap_m(track, *row) > -TOUCHES_M and track[:, 1].max() < 1.6
+            assert abs(track[-1, 0]) > 6.0
+
+
+def test_who_fits_between_two_things_goes_between_them() -> None:
+    """Things a person's width and more apart are two bodies, nearer ones are one."""
+    apart = standing(thing("bin", 0.0, -0.8, 0.0), thing("bin", 0.0, 0.95, 0.0))
+    near = standing(thing("bin", 0.0, -0.6, 0.0), thing("bin", 0.0, 0.6, 0.0))
+    assert len(apart.bodies) == 2 and len(near.bodies) == 1
+    assert np.abs(shown(apart, 0.1, True)[:, 1]).max() < 0.35
+
+
+def asked(things: Standing) -> EventQuery:
+    """A question with the robot far away."""
+    return EventQuery(
+        episode="t", tick=0, tick_ms=50, robot_x_m=-90.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
+        robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(), standing=things.bodies,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", ["bike", "cafe", "fence"])
+@pytest.mark.parametrize("moves", [walked_on, pressed_on], ids=["walks", "presses"])
+def test_directed_people_step_round_it_too(kind: str, moves: object) -> None:
+    """People of events, who know the query alone, go round what it holds and walk on; without it they walk through."""
+    one = thing(kind, 0.0, 0.05, 1.3)
+    for things in (standing(one), Standing()):
+        walker, track = Walker(x_m=-3.0, y_m=0.0, heading_rad=0.0), []
+        for _ in range(160):
+            walker = moves(walker, 0.0, 1.3, Sight(asked(things)))  # type: ignore[operator]
+            track.append((walker.x_m, walker.y_m))
+        assert walker.x_m > 3.0
+        assert (gap_m(np.array(track), one) > -TOUCHES_M) == bool(things.bodies)
+
+
+def test_a_director_is_told_of_what_is_near_alone() -> None:
+    """Of two things the one within reach of somebody is in the query, and it survives the wire."""
+    things = standing(thing("bin", 0.0), thing("planter", 12.0))
+    (near,) = things.near(np.array([[0.8, 0.0], [5.0, 0.0]]))
+    query = msgspec.structs.replace(asked(things), standing=(near,))
+    assert (near.x_m, near.y_m) == pytest.approx((0.0, 0.0))
+    assert msgspec.json.decode(msgspec.json.encode(query), type=EventQuery) == query
+    assert things.near(np.array([[5.0, 0.0]])) == () and things.near(np.zeros((0, 2))) == ()
