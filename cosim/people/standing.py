@@ -29,7 +29,7 @@ class Standing:
 
     def __init__(self, bodies: Sequence[StandingBody] = ()) -> None:
         self.bodies = tuple(bodies)
-        self._seen = [seen(body) for body in self.bodies]
+        self._seen = [as_met(body) for body in self.bodies]
         self._xy = np.array([(body.x_m, body.y_m) for body in self.bodies]).reshape(-1, 2)
         self._reach_m = np.array([within_reach_m(body) for body in self._seen])
 
@@ -75,7 +75,7 @@ def standing_bodies(obstacles: Sequence[Obstacle], walkable: Polygon | MultiPoly
     return Standing(bodies)
 
 
-def seen(body: StandingBody) -> RobotBody:
+def as_met(body: StandingBody) -> RobotBody:
     """A body as one steps round it."""
     pose = Pose(body.x_m, body.y_m, body.heading_rad)
     return RobotBody(pose, (0.5 * body.length_m, 0.5 * body.width_m), 0.0, (body.closed_x, body.closed_y))

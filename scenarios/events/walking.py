@@ -9,7 +9,7 @@ import numpy as np
 
 from cosim.core.geometry import Pose, wrap_angle
 from cosim.core.state import PERSON_RADIUS_M
-from cosim.people.standing import seen
+from cosim.people.standing import as_met
 from cosim.people.steering import Vector
 from cosim.people.yielding import RobotBody, stepped_round, touches, within_reach_m
 from cosim.spec.events import Event, EventQuery, Walker
@@ -119,7 +119,7 @@ def _round_things(walker: Walker, wanted: Vector, query: EventQuery) -> Vector:
     """Where a step ends that should end at `wanted` (m), once it is led round what stands there; `wanted` itself where
     it is not."""
     for thing in query.standing:
-        body = seen(thing)
+        body = as_met(thing)
         if math.dist(wanted, body.pose[:2]) < within_reach_m(body):
             x_m, y_m = stepped_round(np.array([[walker.x_m, walker.y_m]]), np.array([wanted]), body)[0].tolist()
             wanted = wanted if math.dist(wanted, (x_m, y_m)) < _SAME_M else (x_m, y_m)
