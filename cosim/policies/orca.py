@@ -1,12 +1,16 @@
-"""`orca`: the reference solver. Sees everybody and the map; anticipates, yields, goes round groups, stops when told.
+"""`orca`: the oracle. Sees everybody and the map; anticipates, yields, goes round groups and things, stops when told.
 
-Each time it acts:
+It knows what no camera shows: where everybody is and how they walk, the free ground, signals and when they change; and
+what people are doing, which tells it who talks, who queues and who holds out a stopping hand. How people will go on it
+does not know: they are taken to walk on as they do.
 
-1. what stands (groups are one obstacle) decides on a lane beside the route;
+The route is led round what stands on it for good (`guide`). Each time it acts:
+
+1. who stands (groups are one obstacle) decides on a lane beside that line;
 2. what moves bends the velocity towards that lane by ORCA half-planes (`cosim.people.orca`), the robot doing all of the
    avoiding, because people need not;
 3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to that velocity
-   while the body stays clear of everybody and inside the walkable area.
+   while the body stays clear of everybody and on free ground (`clearance`).
 
 Red signals, cars near a crossing and a stopping hand limit the speed so that it comes to rest before them.
 """
@@ -18,16 +22,16 @@ from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
-import shapely
-from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats, Polyline, wrap_angles
 from cosim.core.state import PERSON_RADIUS_M, Command, People
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
 from cosim.policies.body import BodyDisks
+from cosim.policies.clearance import Clearance
 from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, who_stands
+from cosim.policies.guide import Guide
 from cosim.policies.route import CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
 from cosim.spec.robot import Robot
 
@@ -38,6 +42,8 @@ MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
 """Delay in seconds and sideways metres per metre of a change of lanes."""
 OUT_OF_A_NOOK: Final = (0.0, 3.0)
 """The same of turning nearly on the spot first, at the slowest speed: past somebody whom it stands right before."""
+
+_TIMES_S: Final = STEP_S * np.arange(1, STEPS + 1)
 
 _HORIZON_S: Final = 3.0
 """ORCA's tau."""
@@ -57,6 +63,14 @@ FOLLOWED: Final = 0.6
 EDGE_COST: Final = 6.0
 """m/s given up when all of a plan lies outside the walkable area."""
 _EDGE_M: Final = 0.06
+_SOLID_M: Final = 0.05
+"""Nearer to the edge than this a corner of the body may touch what stands there."""
+_SOLID_COST: Final = 30.0
+_DEEP_M: Final = 0.4
+_SOON: Final = 5
+"""So many steps of two STEP_S a plan is kept off what is solid; later ones will be chosen anew."""
+_JUMP_M: Final = 1.0
+_STRAYED_M: Final = 2.6
 _PATIENCE_S: Final = 3.0
 STUCK_M: Final = 0.5
 """A robot that has not come this far for PATIENCE_S, and was not held, takes tighter ways."""
@@ -82,10 +96,18 @@ PATIENT: Final = Weights(_CLEARANCE_M, 0.4, 1.0, EDGE_COST)
 STUCK: Final = Weights(_TIGHT_M, 2.5, 0.1, 0.5 * EDGE_COST)
 
 
-class Orca:
-    """Anticipates, yields, goes round groups, stops for a hand: the reference solver; knows what no camera sees."""
+class Here(NamedTuple):
+    """The way to the goal, the robot's arc length on it, and the room beside it."""
 
-    manifest = Manifest("orca", version="1", rate_hz=10.0, camera=None, privileged=True)
+    way: Way
+    s_m: float
+    clearance: Clearance
+
+
+class Orca:
+    """Anticipates, yields, goes round groups, stops for a hand: the oracle; knows what no camera sees."""
+
+    manifest = Manifest("orca", version="2", rate_hz=5.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)
@@ -95,8 +117,10 @@ class Orca:
         self._stuck_s = 0.0
         self._stuck_at = (math.inf, math.inf)
         self._last_time_s = 0.0
-        self._way: tuple[Polyline, Way] | None = None
-        self._room: tuple[Polygon | MultiPolygon, shapely.Geometry] | None = None
+        self._here: Here | None = None
+        self._guide: tuple[Polyline, Guide] | None = None
+        self._line = Polyline([(0.0, 0.0), (1.0, 0.0)])
+        self._was = (math.inf, math.inf)
 
     def act(self, observation: Observation) -> Command:
         known = observation.privileged
@@ -111,27 +135,28 @@ class Orca:
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
             self._stuck_s, self._stuck_at = 0.0, (x_m, y_m)
 
-        way, room = self._way_of(known), self._room_of(known)
+        here = self._find(known)
         people = nearby(known)
         ends = lines(people)
         disks = BodyDisks.of(robot)
-        aim_m = lane_past(known, disks, way, room, ends, self._lane_m)
-        wished = bent(known, robot, way, people, aim_m, limit_mps)
-        plans = all_plans(lanes_inside(known, way, room), [min(speed, limit_mps) for speed in speeds_of(robot)])
-        ahead, gaps = foreseen(known, robot, way, plans, people, ends)
+        aim_m = lane_past(known, disks, here, ends, self._lane_m)
+        wished = bent(known, robot, here, people, aim_m, limit_mps)
+        plans = all_plans(lanes_inside(here), [min(speed, limit_mps) for speed in speeds_of(robot)])
+        ahead, gaps = foreseen(known, robot, here, plans, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
-        out = outside(way, room, ahead, robot.length_m * 2 / 7)
-        out = weights.edge * out + _NEARNESS_COST * car_nearness(known, disks, ahead)
-        score = self._scores(known, plans, ahead, gaps, wished, aim_m, weights) - out
+        out, deeper = off_ground(known, here, ahead, robot.length_m * 2 / 7)
+        cost = weights.edge * out + _SOLID_COST * deeper + _NEARNESS_COST * car_nearness(known, disks, ahead)
+        score = self._scores(known, here, plans, ahead, gaps, wished, aim_m, weights) - cost
         best = int(np.argmax(score))
         if plans.speed_mps[best] > 0.0:
             self._lane_m = float(plans.lane_m[best]) if plans.delay_s[best] == 0.0 else self._lane_m
-        v_mps, w_radps = ahead.command[best]
+        v_mps, w_radps = ahead.command[:, best]
         return Command(float(v_mps), float(w_radps))
 
     def _scores(
         self,
         known: Privileged,
+        here: Here,
         plans: Plans,
         ahead: Ahead,
         gaps: Floats,
@@ -141,26 +166,32 @@ class Orca:
     ) -> Floats:
         """How good each plan is among people, (K,) in m/s of speed."""
         near = max(round(NEAR_S / STEP_S), 1)
-        velocity = (ahead.pose[near - 1, :, :2] - known.robot.pose.xy) / (near * STEP_S)
+        velocity = (ahead.pose[near - 1, :2].T - known.robot.pose.xy) / (near * STEP_S)
         off_wish = np.hypot(*(velocity - wished).T)
-        progress = (ahead.s_m[-1] - known.route_s_m) / (STEPS * STEP_S)
+        progress = (ahead.s_m[-1] - here.s_m) / (STEPS * STEP_S)
         lanes = LANE_COST * np.abs(plans.lane_m - aim_m) + _CHANGE_COST * np.abs(plans.lane_m - self._lane_m)
         nearness = _NEARNESS_COST * np.maximum(weights.clearance_m - gaps, 0.0)
         touch = TOUCH_COST * np.maximum(0.05 - gaps, 0.0)
         scores: Floats = weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
         return scores
 
-    def _way_of(self, known: Privileged) -> Way:
-        if self._way is None or self._way[0] is not known.route:
-            self._way = (known.route, Way(known.route))
-        return self._way[1]
-
-    def _room_of(self, known: Privileged) -> shapely.Geometry:
-        if self._room is None or self._room[0] is not known.free:
-            room = shapely.buffer(known.free, -_EDGE_M)
-            shapely.prepare(room)
-            self._room = (known.free, room)
-        return self._room[1]
+    def _find(self, known: Privileged) -> Here:
+        """Where the robot is on its line, which is led anew from where it was put or has strayed to."""
+        x_m, y_m, _ = known.robot.pose
+        if self._guide is None or self._guide[0] is not known.route:
+            clearance = Clearance(known.free, known.route)
+            self._guide, self._here = (known.route, Guide(clearance, known.route)), None
+        here, jumped = self._here, math.dist(self._was, (x_m, y_m)) > _JUMP_M
+        self._was = x_m, y_m
+        if here is not None and not jumped:
+            s_m, lateral_m = self._line.project(x_m, y_m, (here.s_m - 2.0, here.s_m + 3.0))
+            if abs(lateral_m) < _STRAYED_M:
+                self._here = here._replace(s_m=s_m)
+                return self._here
+        guide = self._guide[1]
+        self._line, self._lane_m = guide.from_here(known.robot.pose.xy), 0.0
+        self._here = Here(Way(self._line), self._line.project(x_m, y_m)[0], guide.clearance)
+        return self._here
 
 
 def nearby(known: Privileged) -> People:
@@ -204,30 +235,28 @@ def stop_limit(known: Privileged) -> float:
     return limit_mps
 
 
-def lane_past(
-    known: Privileged, disks: BodyDisks, way: Way, room: shapely.Geometry, ends: Floats, current_m: float
-) -> float:
-    """The lane beside the route, m to the left, on which the robot best gets past what stands ahead."""
-    here = way.lateral(known.robot.pose, known.route_s_m)
+def lane_past(known: Privileged, disks: BodyDisks, here: Here, ends: Floats, current_m: float) -> float:
+    """The lane beside the way, m to the left, on which the robot best gets past what stands ahead."""
+    way, s_m, clearance = here
+    beside = way.lateral(known.robot.pose, s_m)
     shift = LANE_SLOPE * LANE_AHEAD_M
-    lane = here + np.clip(LANES_M[:, None] - here, -shift, shift)
-    points = way.place(np.broadcast_to(known.route_s_m + LANE_AHEAD_M, lane.shape), lane)
+    lane = beside + np.clip(LANES_M[:, None] - beside, -shift, shift)
+    points = way.place(np.broadcast_to(s_m + LANE_AHEAD_M, lane.shape), lane)
     gaps = np.full(len(LANES_M), np.inf)
     if len(ends):
         gaps = (distances(points, ends) - PERSON_RADIUS_M - disks.radius_m).min(axis=(1, 2))
-    out = ~shapely.contains_xy(room, points[..., 0], points[..., 1])
-    out &= known.route_s_m + LANE_AHEAD_M < way.length_m
+    out = (clearance.at(points) < _EDGE_M) & (s_m + LANE_AHEAD_M < way.length_m)
     cost = LANE_COST * np.abs(LANES_M) + 0.5 * _CHANGE_COST * np.abs(LANES_M - current_m)
     cost += _NEARNESS_COST * np.maximum(_CLEARANCE_M - gaps, 0.0) + EDGE_COST * out.mean(axis=1)
     return float(LANES_M[int(np.argmin(cost))])
 
 
-def bent(known: Privileged, robot: Robot, way: Way, people: People, aim_m: float, limit_mps: float) -> Floats:
+def bent(known: Privileged, robot: Robot, here: Here, people: People, aim_m: float, limit_mps: float) -> Floats:
     """The velocity (2,) towards the lane, bent so that nobody who walks is met within HORIZON_S."""
     state = known.robot
-    here = way.lateral(state.pose, known.route_s_m)
-    lane_m = here + max(-1.0, min(1.0, aim_m - here))
-    ahead = way.place(np.array(known.route_s_m + 2.0), np.array(lane_m)) - state.pose.xy
+    beside = here.way.lateral(state.pose, here.s_m)
+    lane_m = beside + max(-1.0, min(1.0, aim_m - beside))
+    ahead = here.way.place(np.array(here.s_m + 2.0), np.array(lane_m)) - state.pose.xy
     wish = limit_mps * ahead / max(float(np.hypot(*ahead)), 1e-9)
     mine = state.v_mps * np.array([math.cos(state.pose.heading_rad), math.sin(state.pose.heading_rad)])
     radius_m = BodyDisks.of(robot).around_m + PERSON_RADIUS_M + _TIGHT_M
@@ -239,11 +268,10 @@ def bent(known: Privileged, robot: Robot, way: Way, people: People, aim_m: float
     return best_velocity(planes, wish, speeds_of(robot)[0])
 
 
-def lanes_inside(known: Privileged, way: Way, room: shapely.Geometry) -> Floats:
-    """The lanes that are walkable somewhere in the next metres, and the route itself."""
-    along, lane = np.meshgrid(known.route_s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
-    points = way.place(along, lane)
-    inside = np.asarray(shapely.contains_xy(room, points[..., 0], points[..., 1])).any(axis=1)
+def lanes_inside(here: Here) -> Floats:
+    """The lanes with room somewhere in the next metres, and the way itself."""
+    along, lane = np.meshgrid(here.s_m + np.array([0.5, 1.5, 3.0, 5.0]), LANES_M)
+    inside = (here.clearance.at(here.way.place(along, lane)) > _EDGE_M).any(axis=1)
     lanes: Floats = LANES_M[inside | (LANES_M == 0.0)]
     return lanes
 
@@ -262,30 +290,34 @@ def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
 
 
 def foreseen(
-    known: Privileged, robot: Robot, way: Way, plans: Plans, people: People, ends: Floats
+    known: Privileged, robot: Robot, here: Here, plans: Plans, people: People, ends: Floats
 ) -> tuple[Ahead, Floats]:
     """What becomes of the plans, and the smallest gap (K,) m of each between the body and anybody."""
-    moving = ~who_stands(people)
-    xy, velocity = people.xy[moving], followed(known, people)[moving]
     state, disks = known.robot, BodyDisks.of(robot)
-    ahead = foresee(way, plans, robot, state.pose, known.route_s_m, (state.v_mps, state.w_radps), xy, velocity)
-    gaps = np.full(ahead.s_m.shape, np.inf)
-    for body in bodies(ahead, disks):
-        if len(xy):
-            away = ahead.people - body[:, :, None]
-            apart = np.sqrt(np.einsum("...i,...i", away, away)) - PERSON_RADIUS_M
-            gaps = np.minimum(gaps, apart.min(axis=-1) - disks.radius_m)
+    ahead = foresee(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
+    moving = ~who_stands(people)
+    xy = people.xy[moving] + _TIMES_S[:, None, None] * followed(known, people)[moving]
+    reach_m = disks.around_m + PERSON_RADIUS_M + _CLEARANCE_M + speeds_of(robot)[0] * _TIMES_S
+    away_m = np.linalg.norm(xy - state.pose.xy, axis=-1)
+    xy = xy[:, (away_m < reach_m[:, None]).any(axis=0)]
+    ends = ends[distances(state.pose.xy, ends) < reach_m[-1]]
+    squared = np.full((*ahead.s_m.shape, 0), np.inf)
+    for x, y in bodies(ahead, disks):
+        if xy.shape[1]:
+            dx, dy = xy[:, None, :, 0] - x[..., None], xy[:, None, :, 1] - y[..., None]
+            squared = np.concatenate([squared, (dx * dx + dy * dy).min(axis=-1)[..., None]], axis=-1)
         if len(ends):
-            gaps = np.minimum(gaps, (distances(body, ends) - PERSON_RADIUS_M - disks.radius_m).min(axis=-1))
-    later = LATER_M_PER_S * STEP_S * np.arange(1, STEPS + 1)[:, None]
-    return ahead, (gaps + later).min(axis=0)
+            apart = distances(np.stack([x, y], axis=-1), ends).min(axis=-1)
+            squared = np.concatenate([squared, (apart * apart)[..., None]], axis=-1)
+    gaps = np.sqrt(squared.min(axis=-1, initial=np.inf)) - PERSON_RADIUS_M - disks.radius_m
+    return ahead, (gaps + LATER_M_PER_S * _TIMES_S[:, None]).min(axis=0)
 
 
-def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[Floats, Floats]:
-    """(STEPS, K, 2) m each: the middles of the two disks of the body."""
-    heading = ahead.pose[..., 2]
-    nose = disks.nose_m * np.stack([np.cos(heading), np.sin(heading)], axis=-1)
-    return ahead.pose[..., :2] + nose, ahead.pose[..., :2] - nose
+def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """x and y, (STEPS, K) m each, of the middles of the two disks of the body."""
+    x, y, heading = ahead.pose[:, 0], ahead.pose[:, 1], ahead.pose[:, 2]
+    nose_x, nose_y = disks.nose_m * np.cos(heading), disks.nose_m * np.sin(heading)
+    return (x + nose_x, y + nose_y), (x - nose_x, y - nose_y)
 
 
 def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
@@ -298,28 +330,27 @@ def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
     if not len(xy):
         return np.zeros(ahead.s_m.shape[1])
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-9)
-    time_s = STEP_S * np.arange(1, STEPS + 1)[:, None]
-    braked_s = np.minimum(time_s, speed / CAR_BRAKE_MPS2)
+    braked_s = np.minimum(_TIMES_S[:, None], speed / CAR_BRAKE_MPS2)
     driven_m = speed * braked_s - 0.5 * CAR_BRAKE_MPS2 * braked_s**2
     cars = xy + driven_m[..., None] * (velocity / speed[:, None])
     gaps = np.full(ahead.s_m.shape, np.inf)
-    for body in bodies(ahead, disks):
-        away = cars[:, None] - body[:, :, None]
-        apart = np.sqrt(np.einsum("...i,...i", away, away)) - radii
+    for x, y in bodies(ahead, disks):
+        apart = np.hypot(cars[:, None, :, 0] - x[..., None], cars[:, None, :, 1] - y[..., None]) - radii
         gaps = np.minimum(gaps, apart.min(axis=-1) - disks.radius_m)
     nearness: Floats = np.clip(_CLEARANCE_M - gaps.min(axis=0), 0.0, CAR_DEEP_M)
     return nearness
 
 
-def outside(way: Way, room: shapely.Geometry, ahead: Ahead, nose_m: float) -> Floats:
-    """(K,) the share of each plan whose base centre, or a point `nose_m` before it, lies outside the walkable area,
-    what is near weighing most."""
-    pose = ahead.pose[::2]
-    nose = pose[..., :2] + nose_m * np.stack([np.cos(pose[..., 2]), np.sin(pose[..., 2])], axis=-1)
-    out = ~shapely.contains_xy(room, pose[..., 0], pose[..., 1]) | ~shapely.contains_xy(
-        room, nose[..., 0], nose[..., 1]
-    )
-    out &= ahead.s_m[::2] < way.length_m
-    weight = np.linspace(1.5, 0.5, len(out))
-    share: Floats = (out * weight[:, None]).mean(axis=0)
-    return share
+def off_ground(known: Privileged, here: Here, ahead: Ahead, nose_m: float) -> tuple[Floats, Floats]:
+    """(K,) the share of each plan in which the base centre, or a point `nose_m` before it, is off free ground, what is
+    near weighing most; and (K,) m: how much deeper in what is solid the body gets soon than it is now."""
+    present = np.array(known.robot.pose)[:, None]
+    pose = np.concatenate([np.broadcast_to(present, (1, *ahead.pose.shape[1:])), ahead.pose[::2]])
+    along = nose_m * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=-1)
+    middle = np.stack([pose[:, 0], pose[:, 1]], axis=-1)
+    room = here.clearance.at(np.stack([middle - along, middle, middle + along]))
+    room[:, 1:][:, ahead.s_m[::2] >= here.way.length_m] = np.inf
+    off, body = room[1:, 1:].min(axis=0) < _EDGE_M, room.min(axis=0)
+    share: Floats = (off * np.linspace(1.5, 0.5, len(body) - 1)[:, None]).mean(axis=0)
+    deeper = np.minimum(body[0], _SOLID_M) - body[1 : 1 + _SOON].min(axis=0)
+    return share, np.clip(deeper, 0.0, _DEEP_M)

@@ -23,9 +23,10 @@ from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, W
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.policies.body import BodyDisks
+from cosim.policies.clearance import Clearance
 from cosim.policies.foresight import STEP_S, Plans, Way, foresee
 from cosim.policies.groups import lines
-from cosim.policies.orca import lane_past
+from cosim.policies.orca import Here, lane_past
 from cosim.policies.route import best_lane, crossing_limit
 from cosim.policies.social_force import bodies_m
 from cosim.records.run_folder import RunFolder, RunSpec
@@ -145,10 +146,10 @@ def test_policies_travel_at_their_robots_pace_and_turn_as_it_can(robot: Robot) -
 def test_foresight_knows_ramps_and_turning_rate(robot: Robot) -> None:
     """What is foreseen of a plan turns and speeds up no faster than the robot does."""
     plans = Plans(np.array([1.5]), np.array([robot.cruise_mps]), np.array([0.9]), np.array([0.0]))
-    way, empty = Way(Polyline([(0.0, 0.0), (50.0, 0.0)])), np.zeros((0, 2))
-    ahead = foresee(way, plans, robot, Pose(5.0, 0.0, -0.8), 5.0, (0.0, 0.0), empty, empty)
-    turns = np.abs(np.diff(np.append(-0.8, ahead.pose[:, 0, 2]))) / STEP_S
-    speeds = np.hypot(*np.diff(np.vstack([[5.0, 0.0], ahead.pose[:, 0, :2]]), axis=0).T) / STEP_S
+    way = Way(Polyline([(0.0, 0.0), (50.0, 0.0)]))
+    ahead = foresee(way, plans, robot, Pose(5.0, 0.0, -0.8), 5.0, (0.0, 0.0))
+    turns = np.abs(np.diff(np.append(-0.8, ahead.pose[:, 2, 0]))) / STEP_S
+    speeds = np.hypot(*np.diff(np.vstack([[5.0, 0.0], ahead.pose[:, :2, 0]]), axis=0).T) / STEP_S
     assert turns.max() == pytest.approx(robot.w_max_radps)
     assert np.diff(np.append(0.0, speeds)).max() <= robot.acceleration_mps2 * STEP_S
 
@@ -159,8 +160,8 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
         beside = standing(8.0, 0.62 + BodyDisks.of(small).radius_m)
         known = seen(small, beside).privileged
         assert known is not None
-        way, ends = Way(known.route), lines(beside)
-        lanes = [lane_past(known, BodyDisks.of(one), way, known.free, ends, 0.0) for one in (small, large)]
+        here = Here(Way(known.route), known.route_s_m, Clearance(known.free, known.route))
+        lanes = [lane_past(known, BodyDisks.of(one), here, lines(beside), 0.0) for one in (small, large)]
         assert lanes[1] < lanes[0] == 0.0
         offsets = [best_lane(known, one, 0.0, patient=True)[0] for one in (small, large)]
         assert offsets[1] < offsets[0] == 0.0

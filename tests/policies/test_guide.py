@@ -1,0 +1,147 @@
+"""What stands on the way: the room beside it, the line led round it, and the oracle driven past it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+import shapely
+from shapely import affinity
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
+
+from cosim.core.geometry import Floats, Polyline, Pose
+from cosim.core.state import NO_VEHICLES, NOBODY, Command, RobotState
+from cosim.episode.ports import Observation, Privileged
+from cosim.policies.clearance import Clearance
+from cosim.policies.guide import Guide
+from cosim.policies.orca import Orca
+from cosim.spec.robot import COURIER
+
+GAP_M = COURIER.width_m + 0.5
+"""What is left free beside everything that stands on a way."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """A walkway about a route, what stands on it, and where the robot's middle may be."""
+
+    walk: Polygon
+    route: Polyline
+    solid: BaseGeometry
+
+    @property
+    def free(self) -> Polygon | MultiPolygon:
+        return shapely.buffer(shapely.difference(self.walk, self.solid), -COURIER.width_m / 2)
+
+
+def straight(*obstacles: Polygon, width_m: float = 3.0) -> Course:
+    """20 m along the x axis."""
+    route = Polyline([(0.0, 0.0), (20.0, 0.0)])
+    return Course(box(-1.0, -width_m / 2, 21.0, width_m / 2), route, shapely.union_all(list(obstacles)))
+
+
+def drawn(seed: int) -> Course:
+    """25 m of a walkway that bends, with something every few metres, half of it on the middle; GAP_M stays free."""
+    random = np.random.default_rng(seed)
+    width_m, radius_m = random.uniform(2.4, 4.0), random.uniform(8.0, 30.0)
+    turn = np.linspace(0.0, 25.0 / radius_m, 60)
+    route = Polyline(radius_m * np.column_stack([np.sin(turn), 1.0 - np.cos(turn)]))
+    walk = LineString(route.points).buffer(width_m / 2, cap_style="square")
+    solid: list[Polygon] = []
+    for s_m in np.arange(4.0, 22.0, 1.5):
+        at, aside_m = route.at(s_m), random.choice([random.normal(0.0, 0.2), random.uniform(-1.0, 1.0) * width_m / 2])
+        length_m, depth_m = random.choice([(0.4, 0.4), (0.6, 1.8), (1.0, 0.5)])
+        thing = affinity.rotate(box(-length_m / 2, -depth_m / 2, length_m / 2, depth_m / 2), random.uniform(0.0, 180.0))
+        x_m, y_m = at.x_m - aside_m * math.sin(at.heading_rad), at.y_m + aside_m * math.cos(at.heading_rad)
+        more = [*solid, affinity.translate(thing, x_m, y_m)]
+        if passable(walk, shapely.union_all(more), route):
+            solid = more
+    return Course(walk, route, shapely.union_all(solid))
+
+
+def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
+    """Whether a disk as wide as GAP_M gets from the start to within reach of the goal."""
+    room = shapely.buffer(shapely.difference(walk, solid), -GAP_M / 2)
+    start, goal = Point(route.points[0]), Point(route.points[-1])
+    return any(part.covers(start) and part.distance(goal) < 0.1 for part in shapely.get_parts(room))
+
+
+def driven(course: Course, pose: Pose, jump: tuple[float, Pose] | None = None) -> Floats:
+    """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put elsewhere once, when
+    it has come so far on the route."""
+    oracle, free, route = Orca(), course.free, course.route
+    oracle.reset("", 0)
+    period = round(20 / oracle.manifest.rate_hz)
+    v, w, s_m, command, track = 0.0, 0.0, 0.0, Command(0.0, 0.0), []
+    for tick in range(1200):
+        if jump is not None and s_m > jump[0]:
+            pose, jump, v, w = jump[1], None, 0.0, 0.0
+            s_m = route.project(pose.x_m, pose.y_m)[0]
+        if tick % period == 0:
+            s_m = route.project(pose.x_m, pose.y_m, (s_m - 2.0, s_m + 2.0))[0]
+            known = Privileged(RobotState(pose, v, w), route, s_m, NOBODY, NO_VEHICLES, {}, (), free)
+            command = oracle.act(Observation(tick, 0.05 * tick, None, v, w, COURIER, known))
+        v += float(np.clip(command.v_mps - v, -0.1, 0.1))
+        w += float(np.clip(np.clip(command.w_radps, -0.65, 0.65) - w, -0.15, 0.15))
+        heading = pose.heading_rad + 0.05 * w
+        pose = Pose(pose.x_m + 0.05 * v * math.cos(heading), pose.y_m + 0.05 * v * math.sin(heading), heading)
+        track.append(pose)
+        if math.dist(pose[:2], route.points[-1]) < 1.0:
+            break
+    return np.array(track)
+
+
+def bodies(track: Floats) -> list[Polygon]:
+    """The robot's outline at each pose."""
+    length, width = COURIER.footprint_m
+    whole = box(-length / 2, -width / 2, length / 2, width / 2)
+    return [
+        affinity.translate(affinity.rotate(whole, heading, origin=(0.0, 0.0), use_radians=True), x, y)
+        for x, y, heading in track
+    ]
+
+
+def test_clearance_is_the_distance_to_the_edge() -> None:
+    """To 3 cm beside what is straight, positive on free ground alone, and never positive far from the route."""
+    course = straight(box(8.0, -0.5, 9.0, 0.5))
+    clearance = Clearance(course.free, course.route)
+    points = np.random.default_rng(0).uniform((0.5, -1.4), (19.5, 1.4), (2000, 2))
+    exact = shapely.distance(course.free.boundary, shapely.points(points))
+    exact = np.where(shapely.contains_xy(course.free, *points.T), exact, -exact)
+    off = np.abs(clearance.at(points) - exact)
+    assert np.quantile(off, 0.9) < 0.03 and off.max() < 0.1
+    assert (clearance.at(np.array([[10.0, 9.0], [-40.0, 0.0], [400.0, 900.0]])) < 0.0).all()
+
+
+def test_the_line_keeps_to_the_route_where_nothing_stands_and_goes_round_what_does() -> None:
+    """A box on the middle of 3 m leaves a gap on its left alone, 1.05 m wide: the line is led through its middle."""
+    bare, blocked = straight(), straight(box(9.0, -1.5, 10.0, 0.45))
+    lines = [Guide(Clearance(c.free, c.route), c.route).from_here(c.route.points[0]) for c in (bare, blocked)]
+    assert np.abs(lines[0].points[:, 1]).max() < 0.1
+    in_gap = lines[1].points[np.abs(lines[1].points[:, 0] - 9.5) < 0.4]
+    assert in_gap[:, 1] == pytest.approx(0.975, abs=0.08)
+    for line in lines:
+        assert line.points[-1] == pytest.approx((20.0, 0.0))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_the_oracle_gets_round_what_stands_on_its_way(seed: int) -> None:
+    """Nothing is touched, the base centre stays on the walkway, the goal is reached at a walking pace or faster."""
+    course = drawn(seed)
+    assert len(shapely.get_parts(course.solid)) >= 3
+    track = driven(course, course.route.at(0.0))
+    assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0 and len(track) < 20 * 25
+    assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
+    assert shapely.contains_xy(course.walk, track[:, 0], track[:, 1]).all()
+
+
+def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
+    """Put back behind what it had passed, and before the other side of it, it goes round that anew."""
+    course = straight(box(8.0, -1.5, 9.0, 0.45), box(12.0, -0.45, 13.0, 1.5))
+    track = driven(course, Pose(0.0, 0.0, 0.0), jump=(10.5, Pose(6.9, -1.0, 0.0)))
+    assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
+    assert np.ptp(np.flatnonzero(np.hypot(*np.diff(track[:, :2], axis=0).T) > 1.0)) == 0
+    assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
