@@ -13,7 +13,9 @@ import shapely
 from shapely.geometry import LineString
 
 from cosim.core.geometry import Floats, Polyline
+from cosim.core.state import PERSON_RADIUS_M
 from cosim.policies.clearance import LATTICE_M, Clearance
+from cosim.policies.groups import distances
 
 _WANTED_M: Final = 0.5
 """Room to either side that is worth a way round."""
@@ -22,6 +24,9 @@ _TIGHT_COST: Final = 6.0
 _ASIDE_COST: Final = 0.15
 """What a metre costs more for each metre that it lies beside the route."""
 _LEAST_M: Final = 0.03
+_PERSON_M: Final = PERSON_RADIUS_M + 0.45
+_PERSON_COST: Final = 60.0
+"""How near to who stands, and how many times dearer, a metre is then."""
 _STEP_M: Final = 0.4
 _ROUNDS: Final = 60
 _PUSH: Final = 0.3
@@ -32,34 +37,38 @@ class Guide:
     """Ways to the end of a route from wherever the robot is."""
 
     def __init__(self, clearance: Clearance, route: Polyline) -> None:
+        self.clearance, self._route = clearance, route
+        depth = clearance.depth[clearance.rows(clearance.cells)]
+        cells, depth = clearance.cells[depth > _LEAST_M], depth[depth > _LEAST_M]
+        self._points = cells * LATTICE_M
+        self._cost = 1.0 + _TIGHT_COST * np.maximum(1.0 - depth / _WANTED_M, 0.0) ** 2
+        self._cost += _ASIDE_COST * _aside(self._points, route)
+        rows = clearance.rows(cells)
+        numbers = np.full(len(clearance.depth) + 2 * clearance.columns + 3, -1)
+        numbers[rows] = np.arange(len(rows))
+        steps = [numbers[rows + i * clearance.columns + j] for i, j in _NEIGHBOURS]
+        self._first = np.concatenate([np.flatnonzero(other >= 0) for other in steps])
+        self._second = np.concatenate([other[other >= 0] for other in steps])
+        self._lengths = np.hypot(*(self._points[self._first] - self._points[self._second]).T)
+        self.search(np.zeros((0, 2, 2)))
+
+    def search(self, ends: Floats) -> None:
+        """Find the ways anew, round people who stand along lines (M, 2, 2) m."""
         from scipy.sparse import csr_array  # 0.2 s, for those who are guided
         from scipy.sparse.csgraph import dijkstra
 
-        self.clearance, self._route = clearance, route
-        depth = clearance.depth[clearance.rows(clearance.cells)]
-        self._cells = clearance.cells[depth > _LEAST_M]
-        depth = depth[depth > _LEAST_M]
-        cost = 1.0 + _TIGHT_COST * np.maximum(1.0 - depth / _WANTED_M, 0.0) ** 2
-        cost += _ASIDE_COST * _aside(self._cells * LATTICE_M, route)
-        numbers = np.full(len(clearance.depth) + 2 * clearance.columns + 3, -1)
-        rows = clearance.rows(self._cells)
-        numbers[rows] = np.arange(len(rows))
-        first, second, lengths = [], [], []
-        for i, j in _NEIGHBOURS:
-            other = numbers[rows + i * clearance.columns + j]
-            there = np.flatnonzero(other >= 0)
-            first.append(there)
-            second.append(other[there])
-            lengths.append(0.5 * LATTICE_M * np.hypot(i, j) * (cost[there] + cost[other[there]]))
-        graph = csr_array(
-            (np.concatenate(lengths), (np.concatenate(first), np.concatenate(second))), shape=(len(rows), len(rows))
+        count, cost = len(self._points), self._cost
+        self._far = np.full(count, np.inf)
+        if not count:
+            return
+        if len(ends):
+            cost = cost + _PERSON_COST * (distances(self._points, ends).min(axis=1) < _PERSON_M)
+        lengths = 0.5 * self._lengths * (cost[self._first] + cost[self._second])
+        graph = csr_array((lengths, (self._first, self._second)), shape=(count, count))
+        goal = self._nearest(self._route.points[-1], np.ones(count, dtype=bool))
+        self._far, self._next = dijkstra(  # type: ignore[call-overload]
+            graph, directed=False, indices=goal, return_predecessors=True
         )
-        self._far = np.full(len(rows), np.inf)
-        if len(rows):
-            goal = self._nearest(route.points[-1], np.ones(len(rows), dtype=bool))
-            self._far, self._next = dijkstra(  # type: ignore[call-overload]
-                graph, directed=False, indices=goal, return_predecessors=True
-            )
 
     def from_here(self, xy: Floats) -> Polyline:
         """The way from (2,) metres to the end of the route; the route itself where none is known."""
@@ -70,11 +79,11 @@ class Guide:
         while at >= 0:
             way.append(at)
             at = int(self._next[at])
-        line = np.vstack([xy, self._cells[way] * LATTICE_M, self._route.points[-1]])
+        line = np.vstack([xy, self._points[way], self._route.points[-1]])
         return self._taut(Polyline(line).resampled(_STEP_M).points)
 
     def _nearest(self, xy: Floats, among: np.ndarray) -> int:
-        off = self._cells * LATTICE_M - xy
+        off = self._points - xy
         return int(np.argmin(np.where(among, off[:, 0] ** 2 + off[:, 1] ** 2, np.inf)))
 
     def _taut(self, points: Floats) -> Polyline:

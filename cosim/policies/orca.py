@@ -72,6 +72,8 @@ _SOON: Final = 5
 _JUMP_M: Final = 1.0
 _STRAYED_M: Final = 2.6
 _PATIENCE_S: Final = 3.0
+_LED_ANEW_S: Final = 1.6
+"""Who has not come on for so long, and somebody stands near, looks for another way."""
 STUCK_M: Final = 0.5
 """A robot that has not come this far for PATIENCE_S, and was not held, takes tighter ways."""
 NEAR_S: Final = 1.2
@@ -115,6 +117,7 @@ class Orca:
     def reset(self, scenario_id: str, seed: int) -> None:
         self._lane_m = 0.0
         self._stuck_s = 0.0
+        self._led_anew_s = _LED_ANEW_S
         self._stuck_at = (math.inf, math.inf)
         self._last_time_s = 0.0
         self._here: Here | None = None
@@ -133,11 +136,11 @@ class Orca:
         x_m, y_m, _ = known.robot.pose
         self._stuck_s += dt_s
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
-            self._stuck_s, self._stuck_at = 0.0, (x_m, y_m)
+            self._stuck_s, self._stuck_at, self._led_anew_s = 0.0, (x_m, y_m), _LED_ANEW_S
 
-        here = self._find(known)
         people = nearby(known)
         ends = lines(people)
+        here = self._find(known, ends)
         disks = BodyDisks.of(robot)
         aim_m = lane_past(known, disks, here, ends, self._lane_m)
         wished = bent(known, robot, here, people, aim_m, limit_mps)
@@ -175,15 +178,20 @@ class Orca:
         scores: Floats = weights.progress * progress - weights.effort * (off_wish + lanes) - nearness - touch
         return scores
 
-    def _find(self, known: Privileged) -> Here:
-        """Where the robot is on its line, which is led anew from where it was put or has strayed to."""
+    def _find(self, known: Privileged, ends: Floats) -> Here:
+        """Where the robot is on its line, which is led anew from where it was put or has strayed to, and round those
+        who stand where it has not come on."""
         x_m, y_m, _ = known.robot.pose
         if self._guide is None or self._guide[0] is not known.route:
             clearance = Clearance(known.free, known.route)
             self._guide, self._here = (known.route, Guide(clearance, known.route)), None
         here, jumped = self._here, math.dist(self._was, (x_m, y_m)) > _JUMP_M
         self._was = x_m, y_m
-        if here is not None and not jumped:
+        blocked = self._stuck_s > self._led_anew_s and len(ends) > 0
+        if blocked:
+            self._guide[1].search(ends)
+            self._led_anew_s = self._stuck_s + _PATIENCE_S
+        if not blocked and here is not None and not jumped:
             s_m, lateral_m = self._line.project(x_m, y_m, (here.s_m - 2.0, here.s_m + 3.0))
             if abs(lateral_m) < _STRAYED_M:
                 self._here = here._replace(s_m=s_m)

@@ -13,7 +13,7 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from cosim.core.geometry import Floats, Polyline, Pose
-from cosim.core.state import NO_VEHICLES, NOBODY, Command, RobotState
+from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState
 from cosim.episode.ports import Observation, Privileged
 from cosim.policies.clearance import Clearance
 from cosim.policies.guide import Guide
@@ -69,7 +69,7 @@ def passable(walk: Polygon, solid: BaseGeometry, route: Polyline) -> bool:
     return any(part.covers(start) and part.distance(goal) < 0.1 for part in shapely.get_parts(room))
 
 
-def driven(course: Course, pose: Pose, jump: tuple[float, Pose] | None = None) -> Floats:
+def driven(course: Course, pose: Pose, jump: tuple[float, Pose] | None = None, people: People = NOBODY) -> Floats:
     """(N, 3) x, y, heading of the oracle every 0.05 s until the goal, or for 60 s. jump: it is put elsewhere once, when
     it has come so far on the route."""
     oracle, free, route = Orca(), course.free, course.route
@@ -82,7 +82,7 @@ def driven(course: Course, pose: Pose, jump: tuple[float, Pose] | None = None) -
             s_m = route.project(pose.x_m, pose.y_m)[0]
         if tick % period == 0:
             s_m = route.project(pose.x_m, pose.y_m, (s_m - 2.0, s_m + 2.0))[0]
-            known = Privileged(RobotState(pose, v, w), route, s_m, NOBODY, NO_VEHICLES, {}, (), free)
+            known = Privileged(RobotState(pose, v, w), route, s_m, people, NO_VEHICLES, {}, (), free)
             command = oracle.act(Observation(tick, 0.05 * tick, None, v, w, COURIER, known))
         v += float(np.clip(command.v_mps - v, -0.1, 0.1))
         w += float(np.clip(np.clip(command.w_radps, -0.65, 0.65) - w, -0.15, 0.15))
@@ -144,4 +144,14 @@ def test_a_robot_that_was_put_elsewhere_is_led_from_there() -> None:
     track = driven(course, Pose(0.0, 0.0, 0.0), jump=(10.5, Pose(6.9, -1.0, 0.0)))
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
     assert np.ptp(np.flatnonzero(np.hypot(*np.diff(track[:, :2], axis=0).T) > 1.0)) == 0
+    assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
+
+
+def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
+    """A long box leaves a way on each side; who stands far inside the shorter one is seen too late, and left behind."""
+    course = straight(box(5.0, -1.1, 17.0, 0.8), width_m=4.6)
+    somebody = People.of(("p0",), [(15.0, 1.55)], [0.0], [0.0], ("stand",))
+    track = driven(course, Pose(0.0, 0.0, 0.0), people=somebody)
+    assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
+    assert min(body.distance(Point(15.0, 1.55)) for body in bodies(track)) > 0.3
     assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
