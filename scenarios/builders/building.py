@@ -32,7 +32,9 @@ CANDIDATES: Final = 6
 _MADE_BY: Final = "made-by.txt"
 _HANGS_S: Final = {"long-horizon": 900.0}
 _HANGS_SHORT_S: Final = 240.0
-"""A candidate that takes longer is given up, on machines that have nothing else to do and on others."""
+"""A candidate that takes longer is given up: many times what it takes."""
+_BEGUN: Final = 2
+"""So often a candidate is begun: once it may have been stopped with the build, twice it ends its process."""
 _POLL_S: Final = 0.1
 _THREADS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -45,10 +47,10 @@ class Kept(msgspec.Struct, frozen=True):
 
 
 class _Tried(msgspec.Struct, frozen=True):
-    """How far a slot has come. under_way: a candidate was begun after those that were dropped."""
+    """How far a slot has come. begun: how often the candidate after those that were dropped was begun."""
 
     dropped: tuple[Dropped, ...] = ()
-    under_way: bool = False
+    begun: int = 0
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,7 @@ def _run(pieces: Sequence[_Piece], folder: Path, jobs: int, tries: int) -> Itera
                     continue
                 working.remove(worker)
                 worker.process.join()
-                most = tries * len(worker.piece.slots)
+                most = _BEGUN * tries * len(worker.piece.slots)
                 if worker.restarts < most and any(slot.name in open_slots for slot in worker.piece.slots):
                     waiting.insert(0, (worker.piece, worker.restarts + 1))
     finally:
@@ -169,6 +171,11 @@ def _look_after(worker: _Worker, folder: Path) -> None:
     limit_s = _HANGS_S.get(worker.piece.suite, _HANGS_SHORT_S)
     if min(since_s, time.monotonic() - worker.heard_s) > limit_s:
         worker.process.kill()
+        worker.process.join()
+        for slot in worker.piece.slots:
+            if (tried := _tried(folder, slot.name)).begun:
+                hung = Dropped(_seed(slot, len(tried.dropped)), "hung")
+                _note(folder, slot, _Tried((*tried.dropped, hung)))
 
 
 def _started(piece: _Piece, folder: Path, tries: int) -> BaseProcess:
@@ -190,14 +197,17 @@ def _fill(slot: Slot, folder: Path, tries: int) -> None:
     """Find the first candidate that the expert solves, and keep it."""
     tried = _tried(folder, slot.name)
     dropped = list(tried.dropped)
-    if tried.under_way:
-        dropped.append(Dropped(_seed(slot, len(dropped)), "the process died or hung"))
+    begun = tried.begun
+    if begun >= _BEGUN:
+        dropped.append(Dropped(_seed(slot, len(dropped)), "its process died"))
+        begun = 0
     for attempt in itertools.count(len(dropped)):
-        _note(folder, slot, _Tried(tuple(dropped)))
         if attempt >= tries:
+            _note(folder, slot, _Tried(tuple(dropped)))
             return
         seed = _seed(slot, attempt)
-        _note(folder, slot, _Tried(tuple(dropped), under_way=True))
+        _note(folder, slot, _Tried(tuple(dropped), begun + 1))
+        begun = 0
         try:
             scenario = _drawn(slot, folder, seed)
         except CosimError as error:
@@ -244,7 +254,7 @@ def _over(folder: Path, slot: Slot, tries: int) -> bool:
     if (folder / f"{slot.name}.json").exists():
         return True
     tried = _tried(folder, slot.name)
-    return not tried.under_way and len(tried.dropped) >= tries
+    return not tried.begun and len(tried.dropped) >= tries
 
 
 def _kept(folder: Path, slot: Slot) -> Kept | None:

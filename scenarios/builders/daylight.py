@@ -13,20 +13,27 @@ from physics.cameras.sun import sun_direction
 LOWEST_SUN_RAD: Final = math.radians(6.0)
 """The sun stands higher than this: no dusk, no night."""
 FOG_M: Final = (150.0, 1500.0)
-"""Thinnest and thickest fog: the other side of a street is seen in any."""
-_FOGGY: Final = 0.15
-"""Share of the scenarios with fog."""
+"""How far one sees in fog, least and most: the other side of a street in any."""
+_FOGGY_EACH: Final = 7
+"""Of so many scenarios one has fog."""
 
 
-def drawn_daylight(rng: np.random.Generator) -> Light:
-    """A light by day: day of the year, hour and clouds evenly, fog now and then."""
-    day = int(rng.integers(1, 366))
+def drawn_daylight(rng: np.random.Generator, number: int) -> Light:
+    """A light by day. number: of the scenario in its suite: quarters of the year, parts of the day, skies and fog take
+    turns, so that all come as often; the rest is drawn."""
+    day = 1 + int((number % 4 + rng.random()) * 365 / 4)
     hours = np.arange(0.0, 24.0, 0.25)
-    bright = [hour for hour in hours.tolist() if sun_rises_rad(hour, day) >= LOWEST_SUN_RAD]
-    hour, clouds = bright[int(rng.integers(len(bright)))], round(float(rng.uniform(0.0, 1.0)), 2)
-    thin, thick = np.log(FOG_M)[::-1]
-    fog_m = float(round(math.exp(rng.uniform(thick, thin)))) if rng.random() < _FOGGY else None
-    return Light(hour=hour, day_of_year=day, cloud_cover=clouds, fog_m=fog_m)
+    bright = np.array([hour for hour in hours.tolist() if sun_rises_rad(hour, day) >= LOWEST_SUN_RAD])
+    part = np.array_split(bright, 3)[number // 4 % 3]
+    clouds = (number // 12 % 3 + rng.random()) / 3
+    near, far = np.log(FOG_M)
+    fog_m = float(round(math.exp(rng.uniform(near, far))))
+    return Light(
+        hour=float(part[int(rng.integers(len(part)))]),
+        day_of_year=day,
+        cloud_cover=round(float(clouds), 2),
+        fog_m=fog_m if number % _FOGGY_EACH == 0 else None,
+    )
 
 
 def sun_rises_rad(hour: float, day_of_year: int, latitude_deg: float = Light().latitude_deg) -> float:

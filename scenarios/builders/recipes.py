@@ -77,7 +77,9 @@ def candidate(slot: Slot, seed: int) -> Scenario:
     _, street_map = place(slot.where)
     drawn = RECIPES[slot.suite].draw(slot, street_map, _graph(slot.where), seed)
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
-    return msgspec.structs.replace(drawn, light=drawn_daylight(rng), split=slot.split, structure=slot.structure)
+    # Another turn for each structure, so that those of one city are not all of one hour.
+    light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
+    return msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
 
 
 def repeated(slot: Slot, of: Scenario) -> Scenario:

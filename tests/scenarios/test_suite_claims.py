@@ -1,0 +1,419 @@
+"""What `cosim suite check` finds out: a suite that keeps all claims, and for each claim one that breaks it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Polyline
+from cosim.place.walk_graph import WalkGraph
+from cosim.spec.events import Event
+from cosim.spec.obstacle import Obstacle
+from cosim.spec.scenario import (
+    Barrier,
+    City,
+    CrowdSpec,
+    RouteCrossing,
+    Scenario,
+    Suite,
+    content_hash,
+    read_suite,
+)
+from scenarios.builders.building import build_suite
+from scenarios.builders.claims import CLAIMS, Read
+from scenarios.builders.daylight import drawn_daylight
+from scenarios.builders.long_horizon import build_long_horizon
+from scenarios.builders.place_claims import faults_in_places, narrow_places, sample_of, ways_left
+from scenarios.builders.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
+from scenarios.builders.recipes import LONG_WAY, RECIPES, Slot
+from scenarios.builders.unit import STRUCTURES, TURN_RAD, build_unit, turn_rad
+from scenarios.catalog import SUITES, load_suite, scenarios_chosen, with_crowd
+from scenarios.events import EVENT_KINDS
+from scenarios.execution.places import place
+from sumo_nets.city.seeds import TEST_SEEDS, VAL_SEEDS
+from sumo_nets.maps.mapstore import about_map, known_maps
+from sumo_nets.maps.wheel_places import WHEEL_PLACES
+from tests.conftest import Cosim
+
+SMALL = City(seed=1, size_m=500.0)
+replace = msgspec.structs.replace
+
+
+def honest(name: str) -> Read:
+    """A suite of the recipe's slots that keeps every claim of its file, drawn on no map, with proofs."""
+    kinds = [*EVENT_KINDS]
+    scenarios = tuple(of_slot(slot, number, kinds) for number, slot in enumerate(RECIPES[name].slots))
+    suite = Suite(name=name, version="1", scenarios=scenarios)
+    return Read(suite, proofs_of(suite))
+
+
+def of_slot(slot: Slot, number: int, kinds: list[str]) -> Scenario:
+    """A scenario as the slot's name promises it."""
+    rng = np.random.default_rng(number)
+    long = slot.structure == LONG_WAY
+    length_m = slot.length_m if long else float(rng.uniform(10.0, 20.0))
+    x_m = 100.0 * number
+    route = np.column_stack([x_m + np.linspace(0.0, length_m, 21), np.zeros(21)])
+    if slot.structure == "curve":
+        side = 1.0 if number % 6 < 3 else -1.0
+        route[11:] = route[10] + np.column_stack([np.zeros(10), side * np.linspace(0.5, 5.0, 10) * length_m / 10.0])
+    line = Polyline(np.round(route, 3))
+    names = kinds[number % 8 : number % 8 + 1] if long else [slot.structure] if slot.structure in kinds else []
+    crossing = RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=long and number % 2 == 0)
+    barrier = Barrier(x_m=x_m, y_m=9.0, heading_rad=0.0, length_m=3.0, strip="s", end=0)
+    return Scenario(
+        id=slot.name,
+        suite=slot.suite,
+        place=replace(slot.where, net_hash="net"),
+        seed=slot.number,
+        start=(*line.points[0].tolist(), 0.0),
+        goal=tuple(line.points[-1].tolist()),
+        route=tuple((x, y) for x, y in line.points.tolist()),
+        crossings=(crossing,) if long or slot.structure == "crosswalk" else (),
+        barriers=(barrier,) if long else (),
+        events=tuple(event_of(kind, number) for kind in names),
+        crowd=CrowdSpec() if long else CrowdSpec(persons=0, vehicles=0),
+        time_limit_s=3000.0 if long else 60.0,
+        ends_on_failure=not long,
+        light=drawn_daylight(rng, number),
+        split=slot.split,
+        structure=slot.structure,
+    )
+
+
+def event_of(kind: str, number: int) -> Event:
+    side = 1 if number // 9 % 2 else -1
+    return Event(
+        id="e0", kind=kind, x_m=0.0, y_m=0.0, heading_rad=0.0, route_s_m=5.0, half_width_m=1.5, side=side, speed_mps=1.3
+    )
+
+
+def proofs_of(suite: Suite) -> Proofs:
+    proofs = tuple(
+        Proof(
+            scenario=s.id, scenario_hash=content_hash(s), expert="orca", expert_version="1", state_hash="00", time_s=9.0
+        )
+        for s in suite.scenarios
+    )
+    return Proofs(
+        suite=suite.name, suite_hash=suite.content_hash, expert="orca 1", first=len(proofs), dropped={}, proofs=proofs
+    )
+
+
+HONEST = {name: honest(name) for name in RECIPES}
+
+
+@pytest.mark.parametrize("claim", CLAIMS)
+@pytest.mark.parametrize("name", RECIPES)
+def test_a_suite_that_keeps_its_claims_has_no_faults(name: str, claim: str) -> None:
+    """Every claim of every recipe can be kept."""
+    assert list(CLAIMS[claim](HONEST[name])) == []
+
+
+def one(read: Read, index: int, **changed: object) -> Read:
+    """The suite with one scenario changed, proved as it is now."""
+    scenarios = list(read.suite.scenarios)
+    scenarios[index] = replace(scenarios[index], **changed)
+    return of(read, scenarios)
+
+
+def all_of(read: Read, change: Callable[[Scenario], Scenario]) -> Read:
+    return of(read, [change(s) for s in read.suite.scenarios])
+
+
+def of(read: Read, scenarios: list[Scenario]) -> Read:
+    suite = replace(read.suite, scenarios=tuple(scenarios))
+    return Read(suite, proofs_of(suite))
+
+
+def with_proof(read: Read, **changed: object) -> Read:
+    """The suite with its first proof changed."""
+    assert read.proofs is not None
+    first, *others = read.proofs.proofs
+    return Read(read.suite, replace(read.proofs, proofs=(replace(first, **changed), *others)))
+
+
+def straightened(scenario: Scenario) -> Scenario:
+    """Its route on one line."""
+    length_m = scenario.route_line.length_m
+    x_m = scenario.start[0]
+    ends = ((x_m, 0.0), (x_m + length_m, 0.0))
+    return replace(scenario, start=(*ends[0], 0.0), goal=ends[1], route=ends)
+
+
+def nearer(scenario: Scenario, share: float) -> Scenario:
+    """Its route cut to a share of it."""
+    points = [scenario.route_line.at(float(s)).xy for s in np.linspace(0.0, share * scenario.route_line.length_m, 21)]
+    route = tuple((float(x), float(y)) for x, y in points)
+    return replace(scenario, goal=route[-1], route=route, crossings=(), events=())
+
+
+def spot_of(read: Read, index: int, other: int) -> Read:
+    """A scenario moved onto another's spot."""
+    there = read.suite.scenarios[other]
+    moved = {name: getattr(there, name) for name in ("place", "start", "goal", "route", "crossings", "events")}
+    return one(read, index, **moved)
+
+
+unit, reactive, long = HONEST["unit"], HONEST["reactive"], HONEST["long-horizon"]
+curve = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "curve")
+crosswalk = next(i for i, s in enumerate(unit.suite.scenarios) if s.structure == "crosswalk")
+night = replace(unit.suite.scenarios[0].light, hour=23.0)
+BROKEN: dict[str, tuple[str, Read, str]] = {
+    "one-missing": ("counts", of(unit, list(unit.suite.scenarios[1:])), "is missing"),
+    "one-of-another-structure": ("counts", one(unit, 0, structure="curve"), "not ('straight'"),
+    "one-elsewhere": ("counts", one(unit, 0, place=City(seed=99, net_hash="net")), "not ('straight', 'val', 1)"),
+    "all-val": ("val and test", all_of(unit, lambda s: replace(s, split="val")), "is test, not a fifth"),
+    "test-where-val-is": ("val and test", one(unit, 0, split="test"), "where val is, too"),
+    "no-net-hash": ("hashes", one(unit, 0, place=City(seed=1)), "has no hash"),
+    "two-nets-of-a-place": ("hashes", one(unit, 0, place=City(seed=1, net_hash="other")), "has 2 nets"),
+    "another-was-proved": ("hashes", Read(unit.suite, reactive.proofs), "was proved"),
+    "no-proofs": ("proofs", Read(unit.suite, None), "has no proofs"),
+    "a-scenario-changed-since": ("proofs", with_proof(unit, scenario_hash="other"), "was changed since"),
+    "a-proof-missing": ("proofs", with_proof(unit, scenario="nobody"), "has no proof"),
+    "a-proof-that-touches": ("proofs", with_proof(unit, obstacles_m=-0.1), "touches"),
+    "a-proof-too-slow": ("proofs", with_proof(unit, time_s=61.0), "no time within the limit"),
+    "two-experts": ("proofs", with_proof(unit, expert="route"), "several experts"),
+    "too-short": ("lengths", of(unit, [nearer(unit.suite.scenarios[0], 0.4)]), "m long"),
+    "not-so-far-in-all": ("lengths", all_of(long, lambda s: nearer(s, 0.95)), "34.67 km in all"),
+    "a-curve-straightened": ("structures", all_of(unit, straightened), "is no 'curve'"),
+    "a-straight-way-bent": ("structures", one(unit, curve, structure="straight"), "is no 'straight'"),
+    "a-crosswalk-with-signals": (
+        "structures",
+        one(unit, crosswalk, crossings=(RouteCrossing(id="c", enter_s_m=3.0, leave_s_m=8.0, signalised=True),)),
+        "is no 'crosswalk'",
+    ),
+    "another-event": ("structures", one(reactive, 0, events=(event_of("frontal", 1),)), "is no 'obstructing'"),
+    "somebody-in-static": ("structures", one(reactive, 8, events=(event_of("frontal", 1),)), "is no 'static'"),
+    "a-long-way-without-barriers": ("structures", one(long, 0, barriers=()), "is no 'route'"),
+    "goes-on-after-a-failure": ("structures", one(unit, 0, ends_on_failure=False), "does not end"),
+    "another-time-limit": ("structures", one(unit, 0, time_limit_s=90.0), "not 60"),
+    "walkers-in-a-reactive-one": ("street life", one(reactive, 0, crowd=CrowdSpec(persons=12)), "12 people"),
+    "an-empty-street-on-a-long-way": (
+        "street life",
+        one(long, 0, crowd=CrowdSpec(persons=0, vehicles=0)),
+        "0 people and 0 vehicles",
+    ),
+    "a-crowd-that-was-asked-for": ("street life", Read(with_crowd(long.suite, persons=9), long.proofs), "9 people"),
+    "no-signals": ("street life", all_of(long, lambda s: replace(s, crossings=())), "0 of 105 ways have signals"),
+    "a-runner": (
+        "events",
+        one(reactive, 0, events=(replace(event_of("obstructing", 1), speed_mps=2.0),)),
+        "walks at 2.00 m/s",
+    ),
+    "a-kind-is-missing-on-long-ways": (
+        "events",
+        all_of(long, lambda s: replace(s, events=tuple(e for e in s.events if e.kind != "lateral"))),
+        "lateral: 0 times",
+    ),
+    "all-from-one-side": (
+        "events",
+        all_of(reactive, lambda s: replace(s, events=tuple(replace(e, side=1) for e in s.events))),
+        "events from right",
+    ),
+    "night": ("spread", one(unit, 0, light=night), "too dark"),
+    "thick-fog": ("spread", one(unit, 0, light=replace(night, hour=12.0, fog_m=40.0)), "foggy"),
+    "always-noon": ("spread", all_of(unit, lambda s: replace(s, light=replace(night, hour=12.0))), "morning: 0.0%"),
+    "never-fog": (
+        "spread",
+        all_of(unit, lambda s: replace(s, light=replace(s.light, fog_m=None))),
+        "0.0% of the scenarios have fog",
+    ),
+    "all-of-one-length": ("spread", all_of(unit, lambda s: nearer(s, 10.5 / s.route_line.length_m)), "long: 0.0%"),
+    "the-same-spot-twice": ("duplicates", spot_of(unit, 3, 0), "is on the spot of straight-001"),
+}
+
+
+@pytest.mark.parametrize("broken", BROKEN)
+def test_a_broken_claim_is_found_out(broken: str) -> None:
+    """A suite with one claim broken has a fault of that claim that names what is wrong."""
+    claim, read, words = BROKEN[broken]
+    assert any(words in fault for fault in CLAIMS[claim](read))
+
+
+def test_every_claim_of_the_file_is_broken_once() -> None:
+    """No claim is kept by whatever comes; size is a matter of the file, broken here."""
+    assert {claim for claim, _, _ in BROKEN.values()} | {"size"} == set(CLAIMS)
+
+
+def test_a_large_file_is_found_out(tmp_path: Path) -> None:
+    """More than 3 MB with its proofs are told."""
+    path = tmp_path / "unit.json"
+    path.write_bytes(b" " * 3_000_001)
+    (fault,) = CLAIMS["size"](Read(unit.suite, unit.proofs, path))
+    assert "3.0 MB" in fault
+
+
+def test_the_recipes_make_what_the_benchmark_says() -> None:
+    """330, 900 and 105 scenarios; a fifth in cities and crops of their own; eleven real places; 36.5 km."""
+    counts = {name: len(recipe.slots) for name, recipe in RECIPES.items()}
+    assert counts == {"unit": 330, "reactive": 900, "long-horizon": 105}
+    for recipe in RECIPES.values():
+        assert sum(slot.split == "test" for slot in recipe.slots) * 5 == len(recipe.slots)
+        assert len({slot.name for slot in recipe.slots}) == len(recipe.slots)
+    assert not set(VAL_SEEDS) & set(TEST_SEEDS) and len(WHEEL_PLACES) == 11
+    assert math.isclose(sum(slot.length_m for slot in RECIPES["long-horizon"].slots), 36_500.0, abs_tol=5.0)
+    statics = [slot for slot in RECIPES["reactive"].slots if slot.like]
+    assert len(statics) == 100 and {slot.structure for slot in statics} == {"static"}
+
+
+def test_scenarios_are_chosen_by_split() -> None:
+    """`--split test` runs those of test alone; a split that no scenario is of is refused."""
+    assert {s.split for s in scenarios_chosen(unit.suite, split="test")} == {"test"}
+    assert len(scenarios_chosen(unit.suite, split="val")) == 264
+
+
+def test_added_street_life_is_marked() -> None:
+    """A crowd that was asked for is another suite, by its version and its hash, and each scenario says so."""
+    busy = with_crowd(reactive.suite, persons=12, vehicles=8)
+    assert busy.version == "1-persons12-vehicles8" and busy.content_hash != reactive.suite.content_hash
+    assert all(s.crowd.added and s.crowd.persons == 12 for s in busy.scenarios)
+
+
+def test_real_places_are_known_by_name() -> None:
+    """Each of the eleven is a map of the list, from a file that the SUMO package installs."""
+    known = known_maps()
+    for name, one_place in WHEEL_PLACES.items():
+        assert known[name].origin == "sumo" and one_place.path.is_file()
+
+
+def test_proofs_survive_their_file(tmp_path: Path) -> None:
+    """Written and read they are the same; what was dropped is counted by reason."""
+    assert unit.proofs is not None
+    first, *others = unit.proofs.proofs
+    dropped = (Dropped(0, "collision with object", "at 3.0 m"), Dropped(1000, "collision with object", "at 9.1 m"))
+    written = write_proofs(tmp_path / "unit.json", "unit", "00", [replace(first, dropped=dropped), *others])
+    assert read_proofs(tmp_path / "unit.json") == written
+    assert written.dropped == {"collision with object": 2} and written.first == len(others)
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_a_unit_scenario_is_what_its_structure_says(structure: str) -> None:
+    """Drawn from a seed: 10 to 20 m, nobody there, a bend of 45 degrees for a curve, one crossing for a crosswalk."""
+    _, street_map = place(SMALL)
+    graph = WalkGraph(street_map)
+    drawn = [build_unit(structure, SMALL, street_map, graph, seed, f"u-{seed}") for seed in range(4)]  # type: ignore[arg-type]
+    again = build_unit(structure, SMALL, street_map, graph, 0, "u-0")  # type: ignore[arg-type]
+    assert again == drawn[0]
+    for scenario in drawn:
+        assert 10.0 <= scenario.route_line.length_m <= 20.0
+        assert scenario.ends_on_failure and scenario.time_limit_s == 60.0
+        assert scenario.crowd.persons == scenario.crowd.vehicles == 0 and not scenario.events
+        assert (abs(turn_rad(scenario.route_line)) >= TURN_RAD[0]) == (structure == "curve")
+        assert len(scenario.crossings) == (structure == "crosswalk")
+
+
+def test_a_long_way_has_the_length_that_is_wanted() -> None:
+    """Within three metres, whatever corners it cuts."""
+    _, street_map = place(SMALL)
+    for length_m in (150.0, 260.0):
+        drawn = build_long_horizon(SMALL, street_map, WalkGraph(street_map), 3, "long", length_m=length_m)
+        assert abs(drawn.route_line.length_m - length_m) <= 3.0
+
+
+@pytest.fixture(scope="module")
+def way() -> Scenario:
+    """A long way in a small city."""
+    _, street_map = place(SMALL)
+    return build_long_horizon(SMALL, street_map, WalkGraph(street_map), 3, "lh-small", length_m=150.0)
+
+
+def test_a_second_way_is_found_out(way: Scenario) -> None:
+    """With its barriers exactly one path leads to the goal; without one of them another is open."""
+    _, street_map = place(SMALL)
+    assert list(ways_left(way, street_map)) == []
+    for number in range(len(way.barriers)):
+        fewer = way.barriers[:number] + way.barriers[number + 1 :]
+        if list(ways_left(replace(way, barriers=fewer), street_map)):
+            break
+    else:
+        pytest.fail("no barrier is needed")
+    claims = {fault.claim for fault in faults_in_places([replace(way, barriers=fewer)], [], None)}
+    assert claims == {"single path"}
+
+
+def test_a_narrow_gap_is_found_out(way: Scenario) -> None:
+    """Obstacles across the sidewalk leave no gap; those that were drawn do."""
+    _, street_map = place(SMALL)
+    assert list(narrow_places(way, street_map)) == []
+    x_m, y_m, heading_rad = way.route_line.at(30.0)
+    aside = [
+        (x_m - left_m * math.sin(heading_rad), y_m + left_m * math.cos(heading_rad)) for left_m in (-2, -1, 0, 1, 2)
+    ]
+    wall = tuple(
+        Obstacle(kind="box", x_m=x, y_m=y, heading_rad=heading_rad + math.pi / 2 - math.pi, form=2) for x, y in aside
+    )
+    (words,) = narrow_places(replace(way, obstacles=wall), street_map)
+    assert "no gap" in words
+
+
+def test_another_net_and_a_place_that_does_not_fit_are_found_out(way: Scenario) -> None:
+    """A scenario of another net, and one whose crossing is not on its map."""
+    other = replace(way, place=replace(way.place, net_hash="other"))
+    assert {fault.claim for fault in faults_in_places([other], [], None)} == {"nets"}
+    astray = replace(way, crossings=(replace(way.crossings[0], id="nowhere"),))
+    assert "fits its place" in {fault.claim for fault in faults_in_places([astray], [], None)}
+
+
+def test_a_sample_holds_every_structure() -> None:
+    """So many of each, the same at every call."""
+    sample = sample_of(reactive.suite, 2)
+    assert sample == sample_of(reactive.suite, 2) and len(sample) == 2 * 9
+    assert len({s.structure for s in sample}) == 9
+
+
+@pytest.mark.engine
+def test_a_build_goes_on_where_it_was_and_its_proofs_hold(tmp_path: Path, cosim: Cosim) -> None:
+    """A candidate whose process died twice is dropped and told, the next is kept; built again, nothing is done anew;
+    the expert comes to the same state to the bit, and another state in the proof is found out."""
+    out = tmp_path / "unit.json"
+    lines: list[str] = []
+    parts = out.with_suffix(".parts")
+    parts.mkdir()
+    (parts / "straight-001.trying").write_text('{"dropped": [], "begun": 2}')
+    suite, proofs = build_suite("unit", out, tell=lambda line, *_: lines.append(line), only=["straight-001"])
+    (proof,) = proofs.proofs
+    assert proof.dropped == (Dropped(0, "its process died"),) and suite.scenarios[0].seed == 1000
+    assert proofs.dropped == {"its process died": 1} and "its process died" in lines[0]
+    kept = (parts / "straight-001.json").stat().st_mtime_ns
+    assert build_suite("unit", out, only=["straight-001"])[0] == suite == read_suite(out)
+    assert (parts / "straight-001.json").stat().st_mtime_ns == kept
+    assert list(faults_in_places(suite.scenarios, ["straight-001"], proofs)) == []
+    said = cosim("suite", "check", str(out), "--sample", "1", "--drive", "0")
+    assert said.returncode == 1 and "curve-001: is missing" in said.stdout
+    write_proofs(out, "unit", suite.content_hash, [replace(proof, state_hash="00")])
+    (fault,) = faults_in_places(suite.scenarios, ["straight-001"], read_proofs(out))
+    assert fault.claim == "proofs to the bit" and "its state is" in fault.words
+    (parts / "made-by.txt").write_text("another version")
+    refused = cosim("suite", "build", "unit", str(out), "--only", "straight-001")
+    assert refused.returncode == 2 and "delete it and build anew" in refused.stderr
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_shipped_suites_keep_their_claims(name: str) -> None:
+    """What ships is what the recipe says, as far as its file and its proofs tell."""
+    path = SUITES[name]
+    read = Read(load_suite(name), read_proofs(path), path)
+    assert {claim: faults for claim, of_claim in CLAIMS.items() if (faults := list(of_claim(read)))} == {}
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", SUITES)
+def test_a_sample_of_the_shipped_suites_holds_in_its_places(name: str) -> None:
+    """One scenario's net, way, gaps, and proof to the bit; `cosim suite check --whole` looks at all."""
+    suite = load_suite(name)
+    short = [s for s in sample_of(suite, 1) if s.structure != LONG_WAY][:1]
+    picked = short or sorted(suite.scenarios, key=lambda s: s.route_line.length_m)[:1]
+    driven = [s.id for s in short]
+    assert list(faults_in_places(picked, driven, read_proofs(SUITES[name]))) == []
+
+
+def test_a_real_place_says_where_it_comes_from() -> None:
+    """A crop is imported from the SUMO package's net when it is asked for, with its licences."""
+    about = about_map("ingolstadt-1")
+    assert about.source == "ingolstadt.net.xml.gz" and any("OpenStreetMap" in words for words in about.licences)
