@@ -27,8 +27,10 @@ _BEND_M: Final = 0.4
 _SLACK_M: Final = 2.0
 _SPEEDS_MPS: Final = (1.1, 1.65)
 _CROSSING_M: Final = (5.0, 12.0)
-_ON_CROSSWALKS: Final = 0.5
-"""Share of the crosswalks without signals on which somebody crosses."""
+_ON_CROSSWALKS: Final = 0.4
+"""Share of the straight crosswalks without signals on which people come towards the robot."""
+_BESIDE_CROSSING_M: Final = 2.0
+"""So far before and behind such a crosswalk the way is straight, as in the scenarios of that event alone."""
 
 
 class _Spot(NamedTuple):
@@ -100,11 +102,13 @@ def _apart(spot: _Spot, chosen: Sequence[tuple[_Spot, EventKind]]) -> bool:
 
 
 def _crosswalks(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> list[_Spot]:
-    """The route's crossings without signals that are neither a step nor a walk of their own."""
+    """The route's crossings without signals that it leads straight over and that are neither short nor long."""
     found = []
     for crossing in crossings:
         strip, half_m = street_map.strips[crossing.id], 0.5 * (crossing.leave_s_m - crossing.enter_s_m)
-        if not crossing.signalised and _CROSSING_M[0] <= 2.0 * half_m <= _CROSSING_M[1]:
+        from_m, to_m = crossing.enter_s_m - _BESIDE_CROSSING_M, crossing.leave_s_m + _BESIDE_CROSSING_M
+        fits = not crossing.signalised and _CROSSING_M[0] <= 2.0 * half_m <= _CROSSING_M[1]
+        if fits and _is_straight(route, from_m, to_m):
             found.append(_Spot(crossing.enter_s_m + half_m, strip.width_m / 2, half_m))
     return found
 
