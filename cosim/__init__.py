@@ -9,7 +9,7 @@ starts no engine and imports none.
 or, holding an episode oneself:
 
     with cosim.Episode(suite.scenarios[0], policy.manifest) as episode:
-        policy.reset(episode.scenario.id, episode.scenario.seed)
+        policy.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))

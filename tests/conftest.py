@@ -5,18 +5,23 @@ from __future__ import annotations
 import hashlib
 import importlib
 import io
+import itertools
 import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from importlib.metadata import version
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+if TYPE_CHECKING:
+    from cosim.spec.pseudonym import Pseudonym
+    from cosim.spec.scenario import Scenario
 
 ROOT = Path(__file__).parents[1]
 PATIENCE_S = 600.0
@@ -39,6 +44,16 @@ COLLECTED = pytest.StashKey[list[str]]()
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     config.stash[COLLECTED] = [item.nodeid for item in items]
+
+
+def seed_in_order(scenarios: Sequence[Scenario]) -> int:
+    """The least seed of a run that goes through scenarios in the order in which they are given here."""
+    from cosim.spec.pseudonym import pseudonym_of
+
+    def told(seed: int) -> list[Pseudonym]:
+        return [pseudonym_of(seed, scenario) for scenario in scenarios]
+
+    return next(seed for seed in itertools.count() if told(seed) == sorted(told(seed)))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -38,6 +38,9 @@ app = typer.Typer(
 SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
 )
+SEED_HELP = (
+    "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
+)
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 
 
@@ -88,7 +91,7 @@ def run_command(
     map_name: Annotated[
         str | None, typer.Option("--map", help="Draw on this place in place of the suite's: a map, a folder, a net.")
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Of the routes drawn with --map.")] = 0,
+    seed: Annotated[int | None, typer.Option(min=0, show_default="another one each time", help=SEED_HELP)] = None,
     roughness: Annotated[
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
@@ -135,7 +138,7 @@ def run_command(
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
     from scenarios.execution.process import LocalProcesses
-    from scenarios.execution.suite_run import run_spec
+    from scenarios.execution.suite_run import run_spec, seed_of_run
     from scenarios.rendering.shared import SharedRenderer, check_shared
 
     if map_name is not None:
@@ -143,7 +146,7 @@ def run_command(
 
         with doing(f"drawing routes on {map_name}"):
             driven_by = robot_called(robot or COURIER.name)
-            whole = suite_on_map(suite, map_name, seed, episodes, roughness or 0.0, event or (), robot=driven_by)
+            whole = suite_on_map(suite, map_name, seed or 0, episodes, roughness or 0.0, event or (), robot=driven_by)
         err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
     elif roughness is not None:
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
@@ -163,6 +166,7 @@ def run_command(
     asks = shared_renderer and check_shared(loaded, drawn_by)
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
+    run_seed = seed_of_run(seed, folder if resume else None)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
     with doing(LOOKING) as tell:
@@ -173,6 +177,7 @@ def run_command(
         endpoint = checked_endpoint(director, "--director")
         outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
     options = EpisodeOptions(
+        seed=run_seed,
         robot=robot,
         suite_hash=whole.content_hash,
         camera=drawn_by,
@@ -188,6 +193,9 @@ def run_command(
             err.print(f"On the air at {on_air.endpoint}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
         held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
         stack.enter_context(held)
+        err.print(
+            f"Seed {run_seed}: what the policy is told that episodes are called is drawn from it.", highlight=False
+        )
         for note in held.notes:
             err.print(note, soft_wrap=True, markup=False, highlight=False)
         done = held.finished()

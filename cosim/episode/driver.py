@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import signal
+import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -21,7 +22,7 @@ from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.ports import BatchPolicy, Manifest, Observation, Policy, Privileged
 
-PolicyCall = Literal["loading", "reset", "first act", "act"]
+PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
 
 MOST_SAID = 500
@@ -64,6 +65,7 @@ class Driver:
         self.source_hash = source_hash
         self._policy = policy
         self._timer: Timer = Untimed() if timer is None else timer
+        self._begun = ""
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
 
@@ -77,20 +79,44 @@ class Driver:
         """The driver of a policy: itself if it is one."""
         return policy if isinstance(policy, Driver) else cls(policy)
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Tell the policy that an episode begins. Raises PolicyError for whatever it raises."""
-        self._answered, self._route = False, None
+        self._begun, self._answered, self._route = episode_id, False, None
         with self._asked("reset", 0):
-            self._policy.reset(scenario_id, seed)
+            self._policy.reset(episode_id, seed)
 
     def act(self, observation: Observation) -> Command:
         """The policy's command. Raises PolicyError for whatever it raises, and for an answer that is no command."""
         own = self._own(observation)
+        if own.reset:
+            self._tell_reset(own.episode, own.tick)
         with self._asked("act" if self._answered else "first act", observation.tick):
             answer = self._policy.act(own)
             command = command_of(answer, rule=self.manifest.waypoints, robot=own.robot)
         self._answered = True
         return command
+
+    def ended(self) -> None:
+        """Tell a policy for many episodes that nothing more is asked about this one, if it has begun. What it raises is
+        printed."""
+        if self._begun and self.batches:
+            self._tell_ended(self._begun)
+        self._begun = ""
+
+    def _tell_reset(self, episode_id: str, tick: int) -> None:
+        """Call `on_reset` of a policy that has one. Raises PolicyError for whatever it raises."""
+        if callable(told := getattr(self._policy, "on_reset", None)):
+            with self._asked("on_reset", tick):
+                told(*([episode_id] if self.batches else []))
+
+    def _tell_ended(self, episode_id: str) -> None:
+        """Call `ended` of a policy that has one."""
+        try:
+            if callable(told := getattr(self._policy, "ended", None)):
+                with self._asked("ended", 0):
+                    told(episode_id)
+        except PolicyError as error:
+            traceback.print_exception(error)
 
     @contextmanager
     def _asked(self, doing: PolicyCall, tick: int) -> Iterator[None]:
@@ -144,15 +170,35 @@ class BatchDriver:
         self._policy = cast(BatchPolicy, driver._policy)
         self._answered: set[str] = set()
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Tell the policy that another episode begins. Raises PolicyError for whatever it raises."""
-        self._answered.discard(scenario_id)
+        self._answered.discard(episode_id)
         with self._driver._asked("reset", 0):
-            self._policy.reset(scenario_id, seed)
+            self._policy.reset(episode_id, seed)
+
+    def ended(self, episode_id: str) -> None:
+        """Tell the policy that nothing more is asked about an episode. What it raises is printed."""
+        self._answered.discard(episode_id)
+        self._driver._tell_ended(episode_id)
 
     def act_batch(self, observations: Sequence[Observation]) -> list[Command | PolicyError]:
         """The policy's command for each observation, or what is wrong with it. The observations become the policy's
         own."""
+        crashes = [self._told_reset(one) for one in observations]
+        asked = [one for one, crash in zip(observations, crashes, strict=True) if crash is None]
+        answers = iter(self._answers(asked) if asked else ())
+        return [next(answers) if crash is None else crash for crash in crashes]
+
+    def _told_reset(self, seen: Observation) -> PolicyError | None:
+        """Tell the policy of a reset, where there was one; its crash if it raises."""
+        try:
+            if seen.reset:
+                self._driver._tell_reset(seen.episode, seen.tick)
+        except PolicyError as error:
+            return error
+        return None
+
+    def _answers(self, observations: Sequence[Observation]) -> list[Command | PolicyError]:
         began = all(observation.episode in self._answered for observation in observations)
         doing: PolicyCall = "act" if began else "first act"
         last = max(observation.tick for observation in observations)
@@ -188,7 +234,9 @@ def _as_many(answers: Sequence[object], count: int) -> list[object]:
 
 def when(doing: PolicyCall, tick: int) -> str:
     """What a policy was doing, in words: "reset", or "act at 3.2 s"."""
-    return f"act at {Clock().time_s(tick):.2f} s" if doing.endswith("act") else doing
+    if doing == "on_reset" or doing.endswith("act"):
+        return f"{doing.removeprefix('first ')} at {Clock().time_s(tick):.2f} s"
+    return doing
 
 
 def told_of(error: BaseException) -> str:

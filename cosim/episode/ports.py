@@ -96,8 +96,10 @@ class Observation:
     """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds.
 
     tick, time_s: since the start of the episode; robot: which one it drives, the same from reset to the end: its size,
-    its pace, its limits; privileged: only for a manifest that declares it; episode: of which one it is: the scenario's
-    id, as `reset` was told.
+    its pace, its limits; privileged: only for a manifest that declares it; episode: of which one it is, as `reset` was
+    told: a name that tells nothing. reset: since the last observation the robot was put back on its way after a
+    failure, elsewhere and at rest, so that what was seen before is no history of this; not at the start of an episode,
+    which `Policy.reset` tells.
 
     >>> from cosim.spec.robot import COURIER
     >>> Observation(tick=5, time_s=0.25, rgb=None, v_mps=0.8, w_radps=0.0, robot=COURIER).privileged is None
@@ -112,6 +114,7 @@ class Observation:
     robot: Robot
     privileged: Privileged | None = None
     episode: str = ""
+    reset: bool = False
 
 
 HowFollowed = Literal["shipped", "atan2"]
@@ -173,12 +176,13 @@ class Manifest:
 class Policy(Protocol):
     """A navigation policy. One object lives through many episodes; `reset` comes before each.
 
+    `on_reset()`, if it has one, is called before the `act` whose observation says `reset`: the robot was put elsewhere.
     Whatever it raises is its own crash, recorded with the episode; it never ends the run.
 
     >>> class Ahead:
     ...     manifest = Manifest("ahead", camera=None)
     ...
-    ...     def reset(self, scenario_id, seed): ...
+    ...     def reset(self, episode_id, seed): ...
     ...
     ...     def act(self, observation):
     ...         return Command(1.0, 0.0)
@@ -187,8 +191,9 @@ class Policy(Protocol):
     @property
     def manifest(self) -> Manifest: ...
 
-    def reset(self, scenario_id: str, seed: int) -> None:
-        """A new episode begins. Anything random must come from `seed`."""
+    def reset(self, episode_id: str, seed: int) -> None:
+        """A new episode begins. Anything random must come from `seed`. Both are drawn from the seed of the run and the
+        scenario, and tell neither its name nor its place in the suite."""
 
     def act(self, observation: Observation) -> Command | NDArray[np.floating]:
         """A command, or waypoints in the robot's frame: (N, 2), x forward and y left, or (N, 4) with the cosine and the
@@ -199,9 +204,11 @@ class BatchPolicy(Policy, Protocol):
     """A policy that can answer for many episodes at once; `cosim run --shared-renderer` asks it so.
 
     One object, in the renderer's process, lives through all episodes of the run, of which several are under way at any
-    time. `reset` begins one of them; what the policy remembers of an episode it keeps under the scenario's id, which
-    every observation carries. Who is asked together is a matter of time and chance: an answer must depend on nothing
-    but its own episode. Without a shared renderer it is a policy like any other, asked by `act`.
+    time. `reset` begins one of them; what the policy remembers of an episode it keeps under its id, which every
+    observation carries. `ended(episode_id)`, if it has one, is called when nothing more will be asked about an episode,
+    however that ended; what it raises is printed and changes nothing. Its `on_reset(episode_id)` is told of which. Who
+    is asked together is a matter of time and chance: an answer must depend on nothing but its own episode. Without a
+    shared renderer it is a policy like any other, asked by `act`.
 
     A bad answer is the crash of its episode; whatever `act_batch` raises, also a number of answers that is not that of
     the observations, is the crash of all that it was asked for.
@@ -209,7 +216,7 @@ class BatchPolicy(Policy, Protocol):
     >>> class Steady:
     ...     manifest = Manifest("steady", camera=CameraSpec(96, 96))
     ...
-    ...     def reset(self, scenario_id, seed): ...
+    ...     def reset(self, episode_id, seed): ...
     ...
     ...     def act(self, observation):
     ...         return self.act_batch([observation])[0]

@@ -11,7 +11,7 @@ class Stop:
 
     manifest = Manifest("stop")
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:
@@ -23,7 +23,7 @@ class Straight:
 
     manifest = Manifest("straight")
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:

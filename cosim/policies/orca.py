@@ -114,7 +114,7 @@ class Orca:
     def __init__(self) -> None:
         self.reset("", 0)
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         self._lane_m = 0.0
         self._stuck_s = 0.0
         self._led_anew_s = _LED_ANEW_S

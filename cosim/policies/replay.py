@@ -16,7 +16,7 @@ class Replay:
         self.manifest = Manifest("replay", rate_hz=1.0 / Clock().tick_s, camera=None)
         self._commands = commands
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:

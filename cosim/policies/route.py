@@ -60,7 +60,7 @@ class Route:
     def __init__(self) -> None:
         self.reset("", 0)
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         self._offset_m = 0.0
         self._bearing_rad = 0.0
         self._stopped_s = 0.0

@@ -56,7 +56,7 @@ class SocialForce:
 
     manifest = Manifest("social_force", version="2", rate_hz=10.0, camera=None, privileged=True)
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:

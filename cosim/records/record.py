@@ -24,6 +24,7 @@ from cosim.judge.nearness import nearness
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
@@ -52,6 +53,8 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
+    seed: of the scenario; run_seed: of the run, from which is drawn what the policy was told that it is called:
+    episode.
     split, structure: of the scenario; crowd_added: its crowd is not the suite's own (`CrowdSpec.added`).
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     walked_into: contacts with people who walked into the robot where it stood; no failures.
@@ -76,6 +79,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     split: Split = "val"
     structure: str = ""
     crowd_added: bool = False
+    run_seed: int = 0
+    episode: str = ""
     robot: str
     policy: str
     policy_version: str
@@ -125,7 +130,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
         return record
 
 
-def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "") -> Record:
+def begun(
+    scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "", run_seed: int = 0
+) -> Record:
     """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
     return Record(
         scenario=scenario.id,
@@ -136,6 +143,8 @@ def begun(scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source
         split=scenario.split,
         structure=scenario.structure,
         crowd_added=scenario.crowd.added,
+        run_seed=run_seed,
+        episode=pseudonym_of(run_seed, scenario).episode,
         robot=scenario.robot,
         policy=manifest.name,
         policy_version=manifest.version,

@@ -16,7 +16,7 @@ from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
     "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "split",
-    "structure", "crowd_added", "robot",
+    "structure", "crowd_added", "run_seed", "episode", "robot",
     "policy", "policy_version", "waypoints", "goal_protocol", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000

@@ -42,7 +42,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
-    "versions", "renderer", "counterfactual", "waypoints",
+    "versions", "renderer", "counterfactual", "waypoints", "seed",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -51,8 +51,8 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
     counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
     that the policy is written in (`cosim.policies.load.source_hash`); waypoints: how those it answers are followed.
-    robots: which drive, and the hash of each. shared_renderer: whether one process drew for all others when it began;
-    what comes out is the same."""
+    seed: see `cosim.spec.options.EpisodeOptions`. robots: which drive, and the hash of each. shared_renderer: whether
+    one process drew for all others when it began; what comes out is the same."""
 
     suite: str
     robots: dict[str, str]
@@ -63,6 +63,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_version: str
     policy_source: str = ""
     waypoints: WaypointRule = WaypointRule()
+    seed: int = 0
     scenarios: tuple[str, ...]
     versions: dict[str, str]
     renderer: str = "unknown"

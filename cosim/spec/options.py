@@ -7,6 +7,7 @@ from typing import Literal
 import msgspec
 
 from cosim.spec.injection import Injected, Live
+from cosim.spec.pseudonym import check_seed
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
@@ -32,17 +33,20 @@ class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How an episode is run. But for the robot, options change what is seen and kept, never what happens in the street.
 
-    robot: which drives (`cosim.spec.robot`), in place of the scenario's own. suite_hash, policy_source: of the suite
-    that the scenario is of and of the file of the policy, for the record.
-    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
-    is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
-    compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
-    one replays. renderer: what draws for the policy in place of a camera of its own.
+    seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
+    (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
+    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. suite_hash, policy_source: of the suite
+    that the scenario is of and of the file of the policy, for the record. camera: what draws pictures. frames_every_s:
+    keep a camera frame every so many seconds, 0 for none. live: where it is on the air meanwhile. director: where its
+    event pedestrians are decided, when not beside it. counterfactual: compare it with its street without the robot.
+    injections: pedestrians that were injected into the episode that this one replays. renderer: what draws for the
+    policy in place of a camera of its own.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
     """
 
+    seed: int | None = None
     robot: str = ""
     suite_hash: str = ""
     policy_source: str = ""
@@ -53,3 +57,6 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
     renderer: RendererAt | None = None
+
+    def __post_init__(self) -> None:
+        check_seed(self.seed)

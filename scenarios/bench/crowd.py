@@ -145,7 +145,7 @@ def _drive(
             gaps_m.extend(widest_gaps(crowd.groups, street.people))
 
     with Episode(scenario, policy.manifest, watches=[watch], through=gliding) as episode:
-        policy.reset(scenario.id, scenario.seed)
+        policy.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < limit_ticks:
             observation = episode.advance(policy.act(observation), until_tick=limit_ticks)

@@ -159,7 +159,7 @@ def _drive(size_m: float, policy: Route) -> _Drive:
 
     with Episode(scenario, policy.manifest, through=timed) as episode:
         act = spent.timed("policy", policy.act)
-        policy.reset(scenario.id, scenario.seed)
+        policy.reset(episode.id, episode.seed)
         observation = episode.reset()
         warm, last = episode.clock.ticks(_WARM_UP_S), episode.clock.ticks(_WARM_UP_S + _MEASURED_S)
         while episode.moment.tick < warm:

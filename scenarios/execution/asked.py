@@ -25,7 +25,7 @@ class Patience(NamedTuple):
     start_s: float = 300.0
 
     def of(self, doing: PolicyCall) -> float:
-        return self.answer_s if doing == "act" else self.start_s
+        return self.start_s if doing in ("loading", "reset", "first act") else self.answer_s
 
 
 class Question(NamedTuple):

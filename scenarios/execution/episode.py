@@ -1,7 +1,7 @@
 """Episode: a scenario that one can hold, and drive period by period of the policy.
 
     with Episode(scenario, policy.manifest) as episode:
-        policy.reset(scenario.id, scenario.seed)
+        policy.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over:
             observation = episode.advance(policy.act(observation))
@@ -33,6 +33,7 @@ from cosim.judge.referee import Verdict
 from cosim.records.record import Record, begun
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.on_air import OnAir
@@ -51,9 +52,9 @@ class Episode:
     """One episode of a scenario, for a policy with this manifest. Use it in a `with` block: its engines start on
     entering and are closed whatever happens. One at a time in a process, because SUMO runs once in each.
 
-    watches: told every tick. waiting: told what the episode waits for when it stands still. through: may
-    put stopwatches or stand-ins before the engines, which have started and not begun. kinds: the table of events that
-    there may be.
+    id, seed: what its policy is told when it begins. watches: told every tick. waiting: told what the episode waits for
+    when it stands still. through: may put stopwatches or stand-ins before the engines, which have started and not
+    begun. kinds: the table of events that there may be.
 
     Raises UsageError when it is used out of turn, PolicyError for an answer that is no command, EngineError when an
     engine fails or runs already, and what its place raises.
@@ -82,8 +83,10 @@ class Episode:
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
         self.manifest, self.options = manifest, options
+        run_seed = 0 if options.seed is None else options.seed
+        self.id, self.seed = pseudonym_of(run_seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)
-        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source)
+        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source, run_seed)
         self._watches, self._waiting, self._through, self._kinds = list(watches), waiting, through, kinds
         self._began_s = time.perf_counter()
         self._setup_s = 0.0
@@ -92,6 +95,7 @@ class Episode:
         self._now: Moment | None = None
         self._frame: Frame | None = None
         self._verdict = Verdict()
+        self._was_reset = False
         self._result: tuple[Record, Log] | None = None
 
     def __enter__(self) -> Self:
@@ -181,6 +185,7 @@ class Episode:
             for watch in self._watches:
                 watch(step, verdict)
             self._now = now = after(step, verdict.reset, stage.parts)
+            self._was_reset |= verdict.reset is not None
             if self.over or self.clock.acts(now.tick) or now.tick == until_tick:
                 return self._observe(stage, now)
             frame, command = None, command if verdict.reset is None else STILL
@@ -202,7 +207,9 @@ class Episode:
         known = stage.known(now) if self.manifest.privileged else None
         rgb = self._frame.rgb if self._frame is not None else None
         v_mps, w_radps, time_s = now.robot.v_mps, now.robot.w_radps, self.clock.time_s(now.tick)
-        return Observation(now.tick, time_s, rgb, v_mps, w_radps, stage.robot, known, self.scenario.id)
+        was_reset = self._was_reset
+        self._was_reset = was_reset and not self.clock.acts(now.tick)
+        return Observation(now.tick, time_s, rgb, v_mps, w_radps, stage.robot, known, self.id, was_reset)
 
     @property
     def _open(self) -> StagedScenario:

@@ -22,6 +22,7 @@ from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.records.record import Record, Status, begun
 from cosim.records.run_folder import RunFolder
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
 from scenarios.execution.asked import Patience, Question
 from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Ready, Unable
@@ -47,15 +48,17 @@ def run_all(
     patience: Patience = Patience(),  # noqa: B008  a frozen value
     renderer: SharedRenderer | None = None,
 ) -> None:
-    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends.
+    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends: in the order of what they are
+    called before the policy, so that one that counts its episodes does not learn which they are.
 
     hello: the policy as it was loaded here. renderer: what draws for all of them; the caller ends it. Raises UsageError
     when a worker cannot load the policy, MachineError when none can be started or a record cannot be written."""
     if renderer is not None:
         hello = msgspec.structs.replace(hello, renderer=renderer.at)
         options = msgspec.structs.replace(options, renderer=renderer.at)
+    options = msgspec.structs.replace(options, seed=folder.spec.seed)
     pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
-    waiting = deque(scenarios)
+    waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
     attempts = dict.fromkeys((s.id for s in scenarios), 0)
     try:
         while waiting or pool.busy:
@@ -228,7 +231,8 @@ class _Pool:
 
     def give_up(self, scenario: Scenario, reason: str, status: Status = "crashed") -> None:
         """Record a scenario that does not come to its end: no worker survives it, or the policy does not answer."""
-        record = begun(scenario, self._hello.manifest, self._folder.spec.suite_hash, self._hello.source_hash)
+        spec = self._folder.spec
+        record = begun(scenario, self._hello.manifest, spec.suite_hash, self._hello.source_hash, spec.seed)
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 

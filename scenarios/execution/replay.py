@@ -53,7 +53,9 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
 
 def replaying(told: Recorded, camera: CameraChoice = "auto", *watches: Watch) -> tuple[Episode, Replay]:
     """The recorded episode once more, not begun yet, and the policy that does what was done in it."""
-    options = EpisodeOptions(suite_hash=told.record.suite_hash, camera=camera, injections=told.record.injections)
+    options = EpisodeOptions(
+        seed=told.record.run_seed, suite_hash=told.record.suite_hash, camera=camera, injections=told.record.injections
+    )
     policy = Replay(told.log.command)
     return Episode(told.scenario, policy.manifest, options, watches=watches), policy
 

@@ -64,6 +64,8 @@ def run_episode(
         another_time = isinstance(error, EngineError) or not isinstance(error, CosimError)
         again = another_time and not isinstance(error, DirectorLost)
         return Outcome(record, None, traceback.format_exc(), again)
+    finally:
+        driver.ended()
     if options.counterfactual:
         try:
             measures = record.measures | beside.compared(episode.scenario, entrances, comparing).measures
@@ -76,7 +78,7 @@ def run_episode(
 
 def drive(episode: Episode, policy: Policy) -> None:
     """Let a policy drive an episode to its end."""
-    policy.reset(episode.scenario.id, episode.scenario.seed)
+    policy.reset(episode.id, episode.seed)
     observation = episode.reset()
     while not episode.over:
         observation = episode.advance(policy.act(observation))

@@ -16,8 +16,9 @@ from cosim.episode.driver import Driver
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
 from cosim.records.record import NO_RENDERER
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder, RunSpec, read_spec
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.pseudonym import drawn_seed
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Suite
 from physics.cameras.choice import camera_of_choice as chosen_camera
@@ -51,7 +52,8 @@ def run(
     one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes that
     survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
     out: the run folder, to be kept and resumed; without one only the table is. shared_renderer: one process draws for
-    all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`).
+    all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`). options: without a seed one is drawn
+    anew, or taken from the run that is resumed; it stands in every row (`run_seed`).
 
     Raises UsageError for names and options that do not exist, SpecError for scenarios that do not fit their places,
     RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
@@ -71,7 +73,7 @@ def run(
             "every process makes one of its own; an object drives in this process alone"
         )
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
-    options = _settled(options, whole, driver)
+    options = _settled(options, whole, driver, seed_of_run(options.seed, Path(out) if resume and out else None))
     asks = shared_renderer and check_shared(driver, chosen_camera(options.camera))
     spec = run_spec(whole, picked, name, driver, options, shared_renderer)
     with ExitStack() as stack:
@@ -111,6 +113,7 @@ def run_spec(
         policy_version=manifest.version,
         policy_source=driver.source_hash,
         waypoints=manifest.waypoints,
+        seed=0 if options.seed is None else options.seed,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
         renderer=renderer_of(chosen_camera(options.camera)) if manifest.camera is not None else NO_RENDERER,
@@ -119,10 +122,17 @@ def run_spec(
     )
 
 
-def _settled(options: EpisodeOptions, whole: Suite, driver: Driver) -> EpisodeOptions:
-    """Options with the suite's hash and the one camera of the run."""
+def seed_of_run(asked: int | None, resumed: Path | None) -> int:
+    """The seed that was asked for; else that of the run that is resumed; else one that is drawn anew."""
+    if asked is not None:
+        return asked
+    return drawn_seed() if resumed is None else read_spec(resumed).seed
+
+
+def _settled(options: EpisodeOptions, whole: Suite, driver: Driver, seed: int) -> EpisodeOptions:
+    """Options with the run's seed, the suite's hash and the one camera of the run."""
     camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
-    return msgspec.structs.replace(options, suite_hash=whole.content_hash, camera=camera)
+    return msgspec.structs.replace(options, seed=seed, suite_hash=whole.content_hash, camera=camera)
 
 
 def _untold(message: object) -> None:

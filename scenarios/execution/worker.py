@@ -64,7 +64,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
         except EOFError:
             return
         os.chdir(home)  # the policy may have gone elsewhere
-        driver = driver or driver_here(hello, timer, say)
+        driver = driver or driver_here(hello, timer, say, again=True)
         done, trouble = run_job(job, driver, say)
         if trouble:
             driver = None  # made anew for the next one
@@ -80,19 +80,23 @@ def _import_engines(say: Hear) -> None:
         raise
 
 
-def driver_here(hello: Hello, timer: Asked, say: Hear) -> Driver:
+def driver_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:
     """What drives here: the policy, or who asks the shared renderer's."""
     if hello.renderer is not None and hello.renderer.asks:
         return AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
-    return policy_here(hello, timer, say)
+    return policy_here(hello, timer, say, again=again)
 
 
-def policy_here(hello: Hello, timer: Asked, say: Hear) -> Driver:
-    """The policy of the run. One that cannot be loaded here, or is another one here, is told, and ends the process."""
+def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:
+    """The policy of the run. One that cannot be loaded here, or is another one here, is told, and ends the process.
+
+    again: it was loaded here before; what it has made of its class's manifest since means nothing."""
     try:
         driver = load_policy(hello.policy, timer)
         if driver.source_hash != hello.source_hash:
             raise UsageError(f"policy '{hello.policy}' was edited while the run was going on: begin another run")
+        if again:
+            driver.manifest = hello.manifest
         if driver.manifest != hello.manifest:
             raise UsageError(
                 f"policy '{hello.policy}' has another manifest in each process: {driver.manifest} in this one, "

@@ -52,7 +52,10 @@ class Leave(msgspec.Struct, frozen=True, tag=True):
 
 
 class Begin(msgspec.Struct, frozen=True, tag=True):
-    """Reset the policy for an episode of the scenario that was entered."""
+    """Reset the policy for an episode of the scenario that was entered: what it is called, and the policy's seed."""
+
+    episode: str
+    seed: int
 
 
 class Knowledge(msgspec.Struct, frozen=True, tag=True):
@@ -74,6 +77,7 @@ class Ask(msgspec.Struct, frozen=True, tag=True):
     v_mps: float
     w_radps: float
     known: Knowledge | None
+    reset: bool = False
 
 
 class Fine(msgspec.Struct, frozen=True, tag=True):

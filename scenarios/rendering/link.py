@@ -160,14 +160,14 @@ class AskedElsewhere(Driver):
         self._address = renderer.address
         self._free: object = None
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         self._free = None
-        link_to(self._address).ask(Begin(), when("reset", 0))
+        link_to(self._address).ask(Begin(episode_id, seed), when("reset", 0))
 
     def act(self, observation: Observation) -> Command:
         known = observation.privileged if self.manifest.privileged else None
         told = None if known is None else self._told(known)
-        request = Ask(observation.tick, observation.v_mps, observation.w_radps, told)
+        request = Ask(observation.tick, observation.v_mps, observation.w_radps, told, observation.reset)
         reply = link_to(self._address).ask(request, when("act", observation.tick))
         assert isinstance(reply, Told)
         return Command(reply.v_mps, reply.w_radps)

@@ -92,22 +92,20 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
 
 
 class _Environment:
-    """An environment process that has connected. scenario: which it runs, None for none; seat: its place in the atlas;
+    """An environment process that has connected. scenario: which it runs, None for none; episode: what that is called
+    before the policy, "" until it begins; seat: its place in the atlas;
     wants: what it waits for; asks_next: it has a picture that the policy was not asked about; free: where its robot may
     be."""
 
     def __init__(self, end: socket.socket, size: tuple[int, int]) -> None:
         self.wire, self.memory = Wire(end), PictureMemory.new(size)
         self.scenario: Scenario | None = None
+        self.episode = ""
         self.seat: SeatKey | None = None
         self.wants: Draw | Begin | Ask | None = None
         self.asks_next = False
         self.free: Polygon | MultiPolygon = MultiPolygon()
         socket.send_fds(end, [b"\0"], [self.memory.descriptor])
-
-    @property
-    def name(self) -> str:
-        return "" if self.scenario is None else self.scenario.id
 
     def reply(self, reply: Reply) -> None:
         """Let it go on. One that has ended does not hear it: reading from it tells. One that cannot be told any more,
@@ -219,12 +217,15 @@ class _Renderer:
     def _leave(self, one: _Environment) -> None:
         if one.seat is not None and self._atlas is not None:
             self._atlas.leave(one.seat)
+        if one.episode and self._driver is not None:
+            self._driver.ended(one.episode)
         one.scenario = one.seat = one.wants = None
+        one.episode = ""
         one.asks_next = False
 
     def _answer(self) -> None:
         """Answer what waits: pictures and resets, and if none of these does, questions to the policy."""
-        waiting = sorted((one for one in self._environments if one.wants is not None), key=lambda one: one.name)
+        waiting = sorted((one for one in self._environments if one.wants is not None), key=lambda one: one.episode)
         asks = [one for one in waiting if isinstance(one.wants, Ask)]
         if len(asks) == len(waiting):
             self._act(asks)
@@ -256,10 +257,10 @@ class _Renderer:
             one.reply(Fine())
 
     def _begin(self, one: _Environment) -> None:
-        assert self._driver is not None and one.scenario is not None
-        one.memory.asked = True
+        assert self._driver is not None and isinstance(one.wants, Begin)
+        one.episode, one.memory.asked = one.wants.episode, True
         try:
-            self._driver.reset(one.scenario.id, one.scenario.seed)
+            self._driver.reset(one.episode, one.wants.seed)
             one.reply(Fine())
         except PolicyError as error:
             one.reply(Refused(str(error), by_policy=True))
@@ -284,7 +285,7 @@ class _Renderer:
         known = None if ask.known is None else _known(ask.known, scenario, one.free)
         rgb = None if self._atlas is None else one.memory.take().rgb
         robot, time_s = robot_called(scenario.robot), Clock().time_s(ask.tick)
-        return Observation(ask.tick, time_s, rgb, ask.v_mps, ask.w_radps, robot, known, scenario.id)
+        return Observation(ask.tick, time_s, rgb, ask.v_mps, ask.w_radps, robot, known, one.episode, ask.reset)
 
 
 def _known(told: Knowledge, scenario: Scenario, free: Polygon | MultiPolygon) -> Privileged:

@@ -53,7 +53,7 @@ def look_at(
         Episode(scenario, driver.manifest, EpisodeOptions(camera=camera_name)) as episode,
         episode.eyes(spec) as camera,
     ):
-        driver.reset(scenario.id, scenario.seed)
+        driver.reset(episode.id, episode.seed)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
             tell(f"simulating to {at_s:g} s", episode.moment.tick / last)

@@ -19,13 +19,14 @@ import pytest
 
 from cosim.core.whole_file import write_whole
 from cosim.place.walk_graph import WalkGraph
-from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
-from tests.conftest import PATIENCE_S, WIDE, Cosim
+from cosim.spec.pseudonym import pseudonym_of
+from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, read_suite, write_suite
+from tests.conftest import PATIENCE_S, WIDE, Cosim, seed_in_order
 
 pytestmark = pytest.mark.engine
 
 POLICIES = """
-import os, signal, time
+import json, os, signal, time
 from pathlib import Path
 import numpy as np
 from cosim.episode.ports import Manifest
@@ -33,17 +34,17 @@ from cosim.core.state import Command
 
 class Base:
     manifest = Manifest("base", camera=None)
-    def reset(self, scenario_id, seed):
-        self.scenario, self.count = scenario_id, 0
+    def reset(self, episode_id, seed):
+        self.scenario, self.count = json.loads(Path("names.json").read_text())[episode_id], 0
     def act(self, observation):
         self.count += 1
         return Command(1.0, 0.0)
 
 class Held(Base):
     # waits before a scenario while there is a file hold-SCENARIO
-    def reset(self, scenario_id, seed):
-        super().reset(scenario_id, seed)
-        hold = Path(f"hold-{scenario_id}")
+    def reset(self, episode_id, seed):
+        super().reset(episode_id, seed)
+        hold = Path(f"hold-{self.scenario}")
         if hold.exists():
             hold.with_name("waits").touch()
         while hold.exists():
@@ -68,6 +69,10 @@ class Unfinished: pass
 """
 
 
+SEED = "2"
+"""Of runs that go through the suites in their order."""
+
+
 @pytest.fixture(scope="module")
 def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A user's folder: a suite of three short scenarios, one of four, and a module with policies."""
@@ -86,6 +91,9 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
         scenarios.append(Scenario(**fields | {"crowd": crowd, "time_limit_s": 1.0}))
     for name, count in (("tiny", 3), ("four", 4)):
         write_suite(Suite(name=name, version="1", scenarios=tuple(scenarios[:count])), folder / f"{name}.json")
+    assert seed_in_order(scenarios) == int(SEED)
+    names = {pseudonym_of(int(SEED), scenario).episode: scenario.id for scenario in scenarios}
+    (folder / "names.json").write_text(json.dumps(names))
     (folder / "mine.py").write_text(POLICIES)
     return folder
 
@@ -135,12 +143,14 @@ def held_before(desk: Path, scenario: str) -> Iterator[Callable[[], bool]]:
 @pytest.fixture(scope="module")
 def whole_run(desk: Path, cosim: Cosim) -> Path:
     """The tiny suite, run without interruption by one process, the camera on."""
-    done = cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", "whole", cwd=desk)
+    done = cosim(
+        "run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED, "--out", "whole", cwd=desk
+    )
     assert done.returncode == 0, done.stderr
     return desk / "whole"
 
 
-HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--out")
+HELD = ("tiny.json", "--policy", "mine:Held", "--episodes", "2", "--seed", SEED, "--out")
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +180,20 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, 
 
 def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path, cosim: Cosim, whole_run: Path) -> None:
     """State hashes and rows are identical for one process and for two."""
-    words = ("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--jobs", "2", "--out", "two")
+    words = (
+        "run",
+        "tiny.json",
+        "--policy",
+        "straight",
+        "--camera",
+        "bullet",
+        "--jobs",
+        "2",
+        "--seed",
+        SEED,
+        "--out",
+        "two",
+    )
     two = cosim(*words, cwd=desk)
     assert two.returncode == 0
     assert "\n3 episodes, " in two.stderr and "episodes of 'straight' on this machine" in two.stderr
@@ -238,7 +261,7 @@ def test_an_episode_finished_before_its_process_died_is_kept(desk: Path, cosim: 
     """A process that dies after sending its record has finished the episode: it is neither run again nor crashed. One
     that dies while it sends has not: half a record is none, and the episode is run again."""
     out = desk / "late"
-    run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--out", out.name, cwd=desk)
+    run = cosim("run", "tiny.json", "--policy", "mine:DiesLate", "--seed", SEED, "--out", out.name, cwd=desk)
     assert run.returncode == 0, run.stdout
     assert list(rows(out)["status"]) == ["done", "done", "done"] and (desk / "half").exists()
     assert sorted(p.name for p in out.glob("logs/*")) == ["worker-0.log", "worker-1.log", "worker-2.log"]
@@ -255,7 +278,9 @@ def test_a_full_disk_ends_the_run_with_the_reason(desk: Path, cosim: Cosim, monk
 
     out = desk / "full"
     monkeypatch.setattr(run_folder, "write_whole", full)
-    run = cosim("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--out", out.name, cwd=desk)
+    run = cosim(
+        "run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED, "--out", out.name, cwd=desk
+    )
     assert run.returncode == 3 and "No space left on device" in run.stderr and "--resume" in run.stderr
     assert "Traceback" not in run.stderr
     assert json.loads((out / "episodes/t-0/record.json").read_text())["status"] == "done"
@@ -390,6 +415,39 @@ def test_the_doctor_finds_every_engine_well(desk: Path, fresh_cosim: Cosim) -> N
     said = fresh_cosim("doctor", cwd=desk)
     assert said.returncode == 0, said.stdout
     assert said.stdout.count("ok") >= 6 and "failed" not in said.stdout
+
+
+def test_a_run_without_a_seed_draws_one_keeps_it_and_goes_on_with_it(desk: Path, cosim: Cosim) -> None:
+    """Another one each time: printed, in run.json, in every row; --resume takes it from there and refuses another."""
+    told = []
+    for out in ("one", "other"):
+        run = cosim(
+            "run", "tiny.json", "--policy", "stop", "--camera", "bullet", "--episodes", "1", "--out", out, cwd=desk
+        )
+        seed = json.loads((desk / out / "run.json").read_text())["seed"]
+        assert run.returncode == 0 and f"Seed {seed}: " in run.stderr
+        assert list(rows(desk / out)["run_seed"]) == [seed]
+        record = json.loads((desk / out / "episodes/t-0/record.json").read_text())
+        (scenario,) = read_suite(desk / out / "scenarios.json").scenarios
+        assert (record["run_seed"], record["episode"]) == (seed, pseudonym_of(seed, scenario).episode)
+        told.append(seed)
+    assert told[0] != told[1]
+    again = (
+        "run",
+        "tiny.json",
+        "--policy",
+        "stop",
+        "--camera",
+        "bullet",
+        "--episodes",
+        "1",
+        "--out",
+        "one",
+        "--resume",
+    )
+    assert f"Seed {told[0]}: " in cosim(*again, cwd=desk).stderr
+    refused = cosim(*again, "--seed", "3", cwd=desk)
+    assert refused.returncode == 2 and f"its seed is {told[0]}, now asked for is 3" in refused.stderr
 
 
 def test_the_record_says_what_it_was_made_with(whole_run: Path) -> None:

@@ -30,8 +30,8 @@ class Fake:
         self.manifest = manifest
         self.does = act
 
-    def reset(self, scenario_id: str, seed: int) -> None:
-        if scenario_id == "bad":
+    def reset(self, episode_id: str, seed: int) -> None:
+        if episode_id == "bad":
             raise SystemExit(3)
 
     def act(self, observation: Observation) -> Command:
@@ -293,3 +293,82 @@ def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
     batch.act_batch([one, two])
     puts = [doing for doing, _ in itertools.groupby(asked)]
     assert puts == ["first act", "act", "first act", "act", "reset", "first act"]
+
+
+def put_back(name: str, tick: int) -> Observation:
+    return dataclasses.replace(seen(tick), episode=name, reset=True)
+
+
+class Remembers(Fake):
+    """Notes what it is told, in order."""
+
+    def __init__(self) -> None:
+        super().__init__(lambda observation: self.noted("act"))
+        self.told: list[object] = []
+
+    def noted(self, what: object) -> Command:
+        self.told.append(what)
+        return STILL
+
+    def on_reset(self) -> None:
+        self.noted("on_reset")
+
+
+class RemembersMany(Remembers):
+    """The same for many episodes."""
+
+    def on_reset(self, episode_id: str) -> None:  # type: ignore[override]
+        if episode_id == "bad":
+            raise LookupError("no history")
+        self.noted(("on_reset", episode_id))
+
+    def ended(self, episode_id: str) -> None:
+        self.noted(("ended", episode_id))
+        if episode_id == "bad":
+            raise LookupError("no such episode")
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[Command]:
+        return [self.noted(one.episode) for one in observations]
+
+
+def test_on_reset_comes_before_the_act_that_follows_a_teleport() -> None:
+    """Only then; a policy without it is asked all the same, and what it raises is a crash told as its own."""
+    policy = Remembers()
+    driver = Driver(policy)
+    for observation in (seen(0), put_back("", 5), seen(10)):
+        driver.act(observation)
+    driver.ended()
+    assert policy.told == ["act", "on_reset", "act", "act"]
+    assert Driver(Fake(lambda one: Command(float(one.reset), 0.0))).act(put_back("", 5)) == Command(1.0, 0.0)
+    policy.on_reset = lambda: [][0]  # type: ignore[method-assign]
+    with pytest.raises(PolicyError, match=r"raised IndexError: list index out of range \(on_reset at 0\.50 s\)"):
+        driver.act(put_back("", 10))
+
+
+def test_a_policy_for_many_episodes_is_told_which_was_put_back_and_which_has_ended() -> None:
+    """Also where it is asked for one at a time; once for each episode that has begun."""
+    policy = RemembersMany()
+    driver = Driver(policy)
+    driver.ended()
+    driver.reset("a", 0)
+    driver.act(put_back("a", 5))
+    driver.ended()
+    driver.ended()
+    assert policy.told == [("on_reset", "a"), "act", ("ended", "a")]
+    many = RemembersMany()
+    batch = BatchDriver(Driver(many))
+    batch.act_batch([put_back("a", 5), dataclasses.replace(seen(10), episode="b")])
+    batch.ended("a")
+    assert many.told == [("on_reset", "a"), "a", "b", ("ended", "a")]
+
+
+def test_an_on_reset_that_raises_is_the_crash_of_its_episode_alone(capfd: pytest.CaptureFixture[str]) -> None:
+    """The others of the batch are answered, in their order; an `ended` that raises is printed and nobody's crash."""
+    many = RemembersMany()
+    batch = BatchDriver(Driver(many))
+    first, bad, last = batch.act_batch([put_back("a", 5), put_back("bad", 6), put_back("c", 7)])
+    assert (first, last) == (STILL, STILL) and many.told[-2:] == ["a", "c"]
+    assert str(bad) == "policy 'mine' raised LookupError: no history (on_reset at 0.30 s)"
+    assert isinstance(batch.act_batch([put_back("bad", 6)])[0], PolicyError) and many.told[-1] == "c"
+    batch.ended("bad")
+    assert "policy 'mine' raised LookupError: no such episode (ended)" in capfd.readouterr().err

@@ -8,7 +8,11 @@ import pytest
 
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.state import Command
-from cosim.episode.ports import CameraSpec, Manifest
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
 from scenarios.checks import small_scenario
 from scenarios.execution.episode import Episode
@@ -31,7 +35,7 @@ class Ahead:
 
     manifest = SEEING
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: object) -> Command:
@@ -61,6 +65,41 @@ def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenar
         episode.reset()
         assert episode.advance(AHEAD, until_tick=3).tick == 3
         assert episode.advance(AHEAD).tick == 5
+
+
+def test_the_observation_after_a_teleport_says_so() -> None:
+    """Put back after leaving its lane: the next observation, and no other, has `reset`; the first one has not."""
+    blind, put_back = Manifest("blind", rate_hz=4.0, camera=None), []
+
+    def watch(step: Step, verdict: Verdict) -> None:
+        if verdict.reset is not None:
+            put_back.append(step.tick)
+
+    whole = msgspec.structs.replace(small_scenario(), time_limit_s=12.0)
+    with Episode(whole, blind, watches=[watch]) as episode:
+        seen = [episode.reset()]
+        while not episode.over:
+            seen.append(episode.advance(Command(1.5, 0.65)))
+    assert put_back and not seen[0].reset
+    assert [one.tick for one in seen if one.reset] == sorted({5 * (tick // 5 + 1) for tick in put_back})
+
+
+def test_an_episode_tells_its_policy_an_opaque_name_and_a_seed(scenario: Scenario) -> None:
+    """Drawn from the run's seed, in every observation and in the record; what happens in the street does not change."""
+    told: list[tuple[str, int]] = []
+
+    class Noting(Ahead):
+        def reset(self, episode_id: str, seed: int) -> None:
+            told.append((episode_id, seed))
+
+        def act(self, observation: Observation) -> Command:
+            assert observation.episode == told[-1][0]
+            return AHEAD
+
+    records = [run_episode(scenario, Noting(), EpisodeOptions(seed=seed)).record for seed in (1, 2)]
+    assert told == [pseudonym_of(seed, scenario) for seed in (1, 2)] and told[0] != told[1]
+    assert [(one.run_seed, one.episode) for one in records] == [(1, told[0][0]), (2, told[1][0])]
+    assert records[0].state_hash == records[1].state_hash
 
 
 def test_an_episode_out_of_turn_says_what_to_do_instead(scenario: Scenario) -> None:

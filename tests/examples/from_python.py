@@ -4,7 +4,7 @@ import cosim
 class Mine:
     manifest = cosim.Manifest("mine", rate_hz=5.0, camera=cosim.CameraSpec(width=96, height=96))
 
-    def reset(self, scenario_id, seed):
+    def reset(self, episode_id, seed):
         """A new episode begins."""
 
     def act(self, observation):

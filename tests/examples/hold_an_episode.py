@@ -3,7 +3,7 @@ import cosim
 scenario = cosim.load_suite("reactive").scenarios[0]
 policy = cosim.load_policy("route")
 with cosim.Episode(scenario, policy.manifest) as episode:
-    policy.reset(scenario.id, scenario.seed)
+    policy.reset(episode.id, episode.seed)
     observation = episode.reset()
     while not episode.over:
         observation = episode.advance(policy.act(observation))

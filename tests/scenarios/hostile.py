@@ -1,12 +1,14 @@
 """Policies that do what no policy should: each a function, called in place of the third answer of an episode.
 
-One class drives all of them: the scenario's name says which one. Run by test_hostile.py in real processes.
+One class drives all of them: `names.json` says which scenario an episode is, for runs of one seed. Run by
+test_hostile.py in real processes.
 """
 
 from __future__ import annotations
 
 import asyncio
 import ctypes
+import json
 import os
 import shutil
 import signal
@@ -46,11 +48,11 @@ class Hostile:
 
     manifest = Manifest("hostile", camera=None, privileged=True)
 
-    def reset(self, scenario_id: str, seed: int) -> None:
-        self.name, self.count = scenario_id, 0
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.name, self.count = json.loads((HERE / "names.json").read_text())[episode_id], 0
         with (HERE / "began.txt").open("a") as began:
-            began.write(f"{scenario_id}\n")
-        RESETS.get(scenario_id, lambda: None)()
+            began.write(f"{self.name}\n")
+        RESETS.get(self.name, lambda: None)()
 
     def act(self, observation: Observation) -> object:
         self.count += 1

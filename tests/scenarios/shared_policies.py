@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import os
+import sys
+import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import ModuleType
 
-from cosim.core.state import Command
+import numpy as np
+
+from cosim.core.state import STILL, Command
 from cosim.episode.ports import CameraSpec, Manifest, Observation
 
 NOTES = "SHARED_NOTES"
@@ -19,7 +25,7 @@ class Seeing:
 
     manifest = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(48, 32))
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: Observation) -> Command:
@@ -37,19 +43,69 @@ class Together(Seeing):
                 notes.write(f"{os.getpid()} {' '.join(one.episode for one in observations)}\n")
         return [self.act(observation) for observation in observations]
 
+    def ended(self, episode_id: str) -> None:
+        if NOTES in os.environ:
+            with Path(os.environ[NOTES]).open("a") as notes:
+                notes.write(f"ended {episode_id}\n")
+
+
+class Spy:
+    """Stands, and notes every text that it is given or that its process has: arguments, environment, folder, names."""
+
+    manifest = Manifest("spy", rate_hz=4.0, camera=None, privileged=True)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        process = [Path("/proc/self", name).read_bytes() for name in ("cmdline", "comm", "environ")]
+        links = [str(path.readlink()) for path in Path("/proc/self/fd").iterdir() if path.is_symlink()]
+        threads = [thread.name for thread in threading.enumerate()]
+        self.note(episode_id, seed, sys.argv, str(Path.cwd()), dict(os.environ), process, links, threads)
+
+    def act(self, observation: Observation) -> Command:
+        self.note(*texts_in(observation, set()))
+        return STILL
+
+    def note(self, *seen: object) -> None:
+        with Path(os.environ[NOTES]).open("a") as notes:
+            notes.write(f"{json.dumps(seen, default=repr)}\n")
+
+
+def texts_in(value: object, known: set[int]) -> list[str]:
+    """Every text that can be reached from a value by fields, attributes and items."""
+    if isinstance(value, str | bytes):
+        return [value if isinstance(value, str) else repr(value)]
+    if id(value) in known or value is None or isinstance(value, int | float | np.ndarray | type | ModuleType):
+        return []
+    known.add(id(value))
+    if isinstance(value, Mapping):
+        parts = [*value.keys(), *value.values()]
+    elif isinstance(value, tuple | list | set | frozenset):
+        parts = [*value]
+    else:
+        names = {
+            *getattr(value, "__dict__", ()),
+            *(n for one in type(value).__mro__ for n in getattr(one, "__slots__", ())),
+        }
+        parts = [getattr(value, name, None) for name in names]
+    return [text for part in parts for text in texts_in(part, known)]
+
 
 class Knowing:
-    """Blind and privileged; does what the name of the episode says, when it is asked for the third time."""
+    """Blind and privileged; does what its episode is called, when it is asked for the third time."""
 
     manifest = Manifest("knowing", rate_hz=4.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.count: dict[str, int] = {}
 
-    def reset(self, scenario_id: str, seed: int) -> None:
-        if scenario_id == "fails-in-reset":
+    def reset(self, episode_id: str, seed: int) -> None:
+        if episode_id == "fails-in-reset":
             raise FileNotFoundError("weights.pt")
-        self.count[scenario_id] = 0
+        self.count[episode_id] = 0
+
+    def on_reset(self, episode_id: str) -> None:
+        if episode_id == "fails-when-put-back":
+            raise LookupError("no history")
+        self.count[episode_id] = -10
 
     def act(self, observation: Observation) -> Command:
         known = observation.privileged

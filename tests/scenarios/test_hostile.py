@@ -18,6 +18,7 @@ import pandas as pd
 import pytest
 
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, WIDE, Cosim, Said
@@ -76,6 +77,7 @@ EXPECTED: dict[str, str] = {
     "stops-itself": "gave no answer for 4 s in act at 0.50 s of stops-itself",
     "hangs-in-reset": "gave no answer for 5 s in reset of hangs-in-reset",
 }
+SEED = "5"
 TWICE = {"dies-and-leaves-processes", "kills-its-parent", "closes-everything"}
 """A process may have died of something else: these are tried again."""
 
@@ -100,9 +102,12 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     whole = build_reactive(EVENT_KINDS["obstructing"], city, street_map, WalkGraph(street_map), 0, "t")
     crowd = CrowdSpec(persons=4, radius_m=50.0, vehicles=1)
     one = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=1.0, events=())
+    names: dict[str, str] = {}
     for name, scenarios in (("hostile", [*EXPECTED]), ("pictures", ["honest", "blackens"])):
         suite = Suite(name=name, version="1", scenarios=tuple(named(one, scenario) for scenario in scenarios))
         write_suite(suite, folder / f"{name}.json")
+        names |= {pseudonym_of(int(SEED), each).episode: each.id for each in suite.scenarios}
+    (folder / "names.json").write_text(json.dumps(names))
     shutil.copy(Path(__file__).with_name("hostile.py"), folder)
     return folder
 
@@ -128,7 +133,7 @@ def war(desk: Path, fresh_cosim: Cosim) -> War:
     """One run over all of them, by two processes at a time."""
     mark = f"hostile-{uuid.uuid4()}"
     times = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{START_S:g}")
-    words = ("--policy", "hostile:Hostile", "--jobs", "2", "--out", "war")
+    words = ("--policy", "hostile:Hostile", "--jobs", "2", "--seed", SEED, "--out", "war")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOSTILE_DESK", str(desk))
         patch.setenv("HOSTILE_MARK", mark)
@@ -173,7 +178,18 @@ def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
 def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:
     """A policy that blackens the picture it is given does not blacken the one that is kept; and what a policy has not
     declared when it was loaded it does not come to know later."""
-    words = ("--policy", "hostile:Painter", "--camera", "bullet", "--frames", "0.25", "--out", "pictures")
+    words = (
+        "--policy",
+        "hostile:Painter",
+        "--camera",
+        "bullet",
+        "--frames",
+        "0.25",
+        "--seed",
+        SEED,
+        "--out",
+        "pictures",
+    )
     run = cosim("run", "pictures.json", *words, cwd=desk)
     assert run.returncode == 0, run.stdout
     honest, blackened = (
@@ -214,7 +230,18 @@ def test_a_run_is_not_finished_with_an_edited_policy(desk: Path, cosim: Cosim, w
 def test_nothing_is_left_of_a_run_that_is_killed(desk: Path) -> None:
     """Also the processes that a policy has started, in sessions of their own, end with the run."""
     mark = f"hostile-{uuid.uuid4()}"
-    words = ("run", "hostile.json", "--scenario", "honest", "--policy", "hostile:Leaves", "--out", "leaves")
+    words = (
+        "run",
+        "hostile.json",
+        "--scenario",
+        "honest",
+        "--policy",
+        "hostile:Leaves",
+        "--seed",
+        SEED,
+        "--out",
+        "leaves",
+    )
     run = subprocess.Popen(
         [sys.executable, "-m", "cosim", *words],
         cwd=desk,

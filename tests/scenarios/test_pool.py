@@ -26,7 +26,7 @@ from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Los
 from scenarios.execution.shepherd import BoundedLog
 from scenarios.execution.wire import Wire
 from scenarios.rendering.shared import End, SharedRenderer
-from tests.conftest import Cosim
+from tests.conftest import Cosim, seed_in_order
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or directory')",
@@ -39,7 +39,7 @@ IN_A_WORKER = sys.argv[:1] == ["-c"]
 
 class Mine:
     manifest = Manifest("mine", camera=None)
-    def reset(self, scenario_id, seed): pass
+    def reset(self, episode_id, seed): pass
     def act(self, observation): return STILL
 class Exits(Mine):
     def __init__(self):
@@ -218,7 +218,7 @@ def all_pooled(
     spec = RunSpec(
         suite="s", robots={"courier": "h"},
         suite_version="1", suite_hash="h", policy="stop", policy_name="stop", policy_version="1",
-        scenarios=tuple(one.id for one in scenarios), versions={},
+        scenarios=tuple(one.id for one in scenarios), versions={}, seed=seed_in_order(scenarios),
     )  # fmt: skip
     hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
@@ -416,3 +416,39 @@ def test_half_a_message_keeps_nobody_waiting() -> None:
         heard += wire.received()
     assert len(heard) == 2
     wire.close()
+
+
+class Notes(Fake):
+    """It runs whatever it is given, at once, and notes it."""
+
+    def __init__(self) -> None:
+        super().__init__(Ready())
+        self.given: list[Job] = []
+
+    def give(self, job: Job) -> None:
+        self.given.append(job)
+        done = begun(job.scenario, load_policy("stop").manifest, "h", run_seed=job.options.seed or 0)
+        self._messages = (*self._messages, Done(job.scenario.id, "crashed", done.encoded()))
+
+
+def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_path: Path) -> None:
+    """A run goes through its scenarios in the order of the names that its policy is told: another one for each seed,
+    always the same for one. Every job carries the run's seed."""
+    suite = Suite(
+        name="s", version="1", scenarios=tuple(msgspec.structs.replace(SCENARIO, id=f"s-{i}") for i in range(8))
+    )
+    orders = {}
+    for seed in (1, 2, 1):
+        folder, notes = tmp_path / f"{seed}-{len(orders)}", Notes()
+        spec = RunSpec(
+            suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="stop", policy_name="stop",
+            policy_version="1", scenarios=tuple(one.id for one in suite.scenarios), versions={}, seed=seed,
+        )  # fmt: skip
+        hello = Hello("stop", load_policy("stop").manifest, "")
+        with RunFolder.create(folder, spec, suite) as held:
+            pool.run_all(held, suite.scenarios, hello, Prepared(notes), jobs=1, tell=lambda _: None)
+        assert {job.options.seed for job in notes.given} == {seed}
+        order = [job.scenario.id for job in notes.given]
+        assert orders.setdefault(seed, order) == order
+    assert sorted(orders[1]) == sorted(orders[2]) == list(spec.scenarios)
+    assert orders[1] != orders[2] and list(spec.scenarios) not in orders.values()

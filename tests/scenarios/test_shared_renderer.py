@@ -25,6 +25,7 @@ from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
 from cosim.records.run_folder import read_records, read_spec
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import CityMap, Light, Scenario, Suite, write_suite
 from scenarios.bench.cameras import busy_street
 from scenarios.checks import small_scenario
@@ -55,7 +56,7 @@ from tests.conftest import Cosim
 from tests.scenarios.shared_policies import NOTES, Knowing, Seeing, Together
 
 OF = "tests.scenarios.shared_policies"
-FRAMES = EpisodeOptions(frames_every_s=0.5)
+FRAMES = EpisodeOptions(seed=7, frames_every_s=0.5)
 
 
 def scenarios_of(*names: str) -> tuple[Scenario, ...]:
@@ -201,7 +202,7 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
             for scenario in scenarios_of(*names):
                 links.append(linked(renderer))
                 links[-1].ask(Enter(scenario))
-                links[-1].ask(Begin())
+                links[-1].ask(Begin(scenario.id, scenario.seed))
             for tick in (0, 5):
                 told = asked_together(renderer, links, *[knows(tick)] * len(links))
                 assert told == [Told(0.59, 0.0)] * len(links)
@@ -228,8 +229,14 @@ def test_one_bad_answer_is_one_crash_and_what_takes_the_policy_down_names_whom_i
         fails = linked(renderer)
         fails.ask(Enter(*scenarios_of("fails-in-reset")))
         with pytest.raises(PolicyError, match=r"policy 'knowing' raised FileNotFoundError: weights\.pt \(reset\)"):
-            fails.ask(Begin())
+            fails.ask(Begin("fails-in-reset", 0))
         fails._wire.close()
+        one, other = begun("honest", "fails-when-put-back")
+        told, crashed = asked_together(renderer, [one, other], *[msgspec.structs.replace(knows(10), reset=True)] * 2)
+        assert told == Told(0.59, 0.0) and isinstance(crashed, Refused) and crashed.by_policy
+        assert crashed.reason == "policy 'knowing' raised LookupError: no history (on_reset at 0.50 s)"
+        for link in (one, other):
+            link._wire.close()
         renderer.tend()
         ends = {
             "hangs": End("the renderer process was ended", 1.0),
@@ -290,12 +297,16 @@ def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
     themselves, in one process; run.json says how it was run, and every question was put by one process."""
     monkeypatch.setenv(NOTES, str(tmp_path / "notes"))
     write_suite(suite_of("a", "b"), tmp_path / "small.json")
-    words = ("--policy", f"{OF}:Together", "--frames", "0.5", "--out", "shared")
+    words = ("--policy", f"{OF}:Together", "--frames", "0.5", "--seed", "7", "--out", "shared")
     said = cosim("run", "small.json", *words, "--jobs", "2", "--shared-renderer", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
     assert same(by_themselves, tmp_path / "shared") and read_spec(tmp_path / "shared").shared_renderer
     notes = [line.split() for line in (tmp_path / "notes").read_text().splitlines()]
-    assert len({line[0] for line in notes}) == 1 and sum(len(line) - 1 for line in notes) == 8
+    ended = [line[1] for line in notes if line[0] == "ended"]
+    asked = [line for line in notes if line[0] != "ended"]
+    assert len({line[0] for line in asked}) == 1 and sum(len(line) - 1 for line in asked) == 8
+    called = {pseudonym_of(7, scenario).episode for scenario in scenarios_of("a", "b")}
+    assert set(ended) == {name for line in asked for name in line[1:]} == called and len(ended) == 2
     assert cosim("run", "small.json", *words, "--resume", cwd=tmp_path).returncode == 0
 
 

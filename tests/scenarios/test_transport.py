@@ -28,7 +28,7 @@ class Ahead:
 
     manifest = Manifest("ahead", rate_hz=4.0, camera=CameraSpec(32, 24))
 
-    def reset(self, scenario_id: str, seed: int) -> None:
+    def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""
 
     def act(self, observation: object) -> Command:
@@ -83,7 +83,7 @@ def test_a_suite_has_the_same_results_over_every_transport(tmp_path: Path, monke
         monkeypatch.setattr(suite_run, kind.__name__, lambda of, kind=kind: (used.append(kind), kind(of))[1])
     one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
     suite = Suite(name="two", version="1", scenarios=(one, msgspec.structs.replace(one, id="other", seed=5)))
-    options = EpisodeOptions(camera="bullet", frames_every_s=0.5)
+    options = EpisodeOptions(seed=7, camera="bullet", frames_every_s=0.5)
     cosim.run(suite, Ahead(), out=tmp_path / "here", options=options)
     cosim.run(suite, f"{__name__}:Ahead", out=tmp_path / "there", options=options)
     assert used == [InProcess, LocalProcesses]
