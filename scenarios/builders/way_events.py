@@ -22,14 +22,17 @@ BESIDE_EVENT_M: Final = 0.95
 _APART_M: Final = 45.0
 """From one event to the next, at least."""
 _FROM_START_M, _FROM_GOAL_M = 30.0, 20.0
-_STEP_M: Final = 5.0
+_LOOK_M: Final = 45.0
+"""So far ahead room is looked for, for one kind after the other."""
+_STEP_M: Final = 2.5
 _BEND_M: Final = 0.4
 _SLACK_M: Final = 2.0
 _SPEEDS_MPS: Final = (1.1, 1.65)
 _CROSSING_M: Final = (5.0, 12.0)
 _ON_CROSSWALKS: Final = 0.4
 """Share of the straight crosswalks without signals on which people come towards the robot."""
-_BESIDE_CROSSING_M: Final = 2.0
+_CROSSING_BEND_M: Final = 0.6
+_BESIDE_CROSSING_M: Final = 1.0
 """So far before and behind such a crosswalk the way is straight, as in the scenarios of that event alone."""
 
 
@@ -59,19 +62,24 @@ def draw_events(
         inside = _FROM_START_M <= spot.s_m <= route.length_m - _FROM_GOAL_M
         if on_crosswalks and inside and rng.random() < _ON_CROSSWALKS and _apart(spot, chosen):
             chosen.append((spot, on_crosswalks[int(rng.integers(len(on_crosswalks)))]))
+    wide_m = 2.0 * (robot.width_m + BESIDE_EVENT_M)
+    spots = [
+        _Spot(s_m, strip.width_m / 2)
+        for s_m in np.arange(_FROM_START_M, route.length_m - _FROM_GOAL_M, _STEP_M).tolist()
+        if (strip := _sidewalk_at(street_map, way, route, s_m)) is not None and strip.width_m >= wide_m
+    ]
     next_s_m = _FROM_START_M
-    for s_m in np.arange(_FROM_START_M, route.length_m - _FROM_GOAL_M, _STEP_M).tolist():
-        strip = _sidewalk_at(street_map, way, route, s_m)
-        if s_m < next_s_m or strip is None or strip.width_m < 2.0 * (robot.width_m + BESIDE_EVENT_M):
+    while next_s_m < route.length_m:
+        near = [spot for spot in spots if next_s_m <= spot.s_m < next_s_m + _LOOK_M and _apart(spot, chosen)]
+        fitting = ((spot, kind) for kind in turns for spot in near if _has_room(kind, spot, route, robot))
+        found = next(fitting, None)
+        if found is None:
+            next_s_m += _LOOK_M
             continue
-        spot = _Spot(s_m, strip.width_m / 2)
-        kind = next((kind for kind in turns if _has_room(kind, spot, route, robot)), None)
-        if kind is None or not _apart(spot, chosen):
-            continue
-        turns.remove(kind)
-        turns.append(kind)
-        chosen.append((spot, kind))
-        next_s_m = s_m + float(rng.uniform(0.6, 1.4)) * EVENT_EVERY_M
+        chosen.append(found)
+        turns.remove(found[1])
+        turns.append(found[1])
+        next_s_m = found[0].s_m + float(rng.uniform(0.6, 1.4)) * EVENT_EVERY_M
     chosen.sort(key=lambda one: one[0].s_m)
     return tuple(_event(f"e{n}", kind, spot, route, robot, rng) for n, (spot, kind) in enumerate(chosen))
 
@@ -108,7 +116,7 @@ def _crosswalks(street_map: StreetMap, route: Polyline, crossings: Sequence[Rout
         strip, half_m = street_map.strips[crossing.id], 0.5 * (crossing.leave_s_m - crossing.enter_s_m)
         from_m, to_m = crossing.enter_s_m - _BESIDE_CROSSING_M, crossing.leave_s_m + _BESIDE_CROSSING_M
         fits = not crossing.signalised and _CROSSING_M[0] <= 2.0 * half_m <= _CROSSING_M[1]
-        if fits and _is_straight(route, from_m, to_m):
+        if fits and _is_straight(route, from_m, to_m, _CROSSING_BEND_M):
             found.append(_Spot(crossing.enter_s_m + half_m, strip.width_m / 2, half_m))
     return found
 
@@ -119,7 +127,7 @@ def _has_room(kind: EventKind, spot: _Spot, route: Polyline, robot: Robot) -> bo
     if layout is None or spot.half_width_m < layout.half_width_m + wider_m(robot):
         return False
     from_m = spot.s_m - layout.event_m[1] - _SLACK_M
-    to_m = spot.s_m + max(_STEP_M, layout.way_m[0] - layout.event_m[0])
+    to_m = spot.s_m + max(2.0 * _STEP_M, layout.way_m[0] - layout.event_m[0])
     return from_m >= 0.0 and to_m <= route.length_m and _is_straight(route, from_m, to_m)
 
 
@@ -130,8 +138,8 @@ def _sidewalk_at(street_map: StreetMap, way: Sequence[Port], route: Polyline, s_
     return strip if strip is not None and strip.kind == "sidewalk" and strip.id in {p.strip for p in way} else None
 
 
-def _is_straight(route: Polyline, from_m: float, to_m: float) -> bool:
-    """Whether the route bends by less than _BEND_M between two of its arc lengths."""
+def _is_straight(route: Polyline, from_m: float, to_m: float, bend_m: float = _BEND_M) -> bool:
+    """Whether the route bends by less than so much between two of its arc lengths."""
     chord = Polyline([route.at(from_m).xy, route.at(to_m).xy])
     between = route.points[(route.s_m > from_m) & (route.s_m < to_m)]
-    return all(abs(chord.project(x, y)[1]) < _BEND_M for x, y in between)
+    return all(abs(chord.project(x, y)[1]) < bend_m for x, y in between)
