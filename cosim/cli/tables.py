@@ -40,15 +40,22 @@ UNITS = {"FC": "/100m", "C": "/100m", "OL": "/100m", "F": "/100m", "V": "m/s"}
 COUNTS = (("collisions", "collisions"), ("out_of_lane", "out of lane"), ("freezings", "freezings"))
 MEANS = (*SHOWN[:3], ("failures_per_100m_route", ""), *SHOWN[3:], ("spl", "SPL"))
 """Those of a run."""
-BY_KIND = (
+WITHOUT_PEOPLE = (
+    ("spl", "SPL"),
+    ("route_completion", "RC"),
+    ("other_collision", "hit\nelse"),
+    ("left_lane", "left\nlane"),
+)
+WITH_PEOPLE = (
+    ("spl", "SPL"),
     ("pedestrian_collision", "hit a\nperson"),
     ("other_collision", "hit\nelse"),
     ("left_lane", "left\nlane"),
     ("broke_rule", "broke\nrule"),
+    ("pedestrian_distance_min_m", "near-\nest m"),
+    ("pedestrian_distance_min_success_m", "of suc-\ncesses"),
 )
-"""Shares of the episodes of a kind of event."""
-NEAREST = ("pedestrian_distance_min_m", "pedestrian_distance_min_success_m")
-"""Means over its episodes, and over those that succeeded."""
+"""Means over the episodes of a kind: shares of them, and metres."""
 
 
 def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
@@ -81,6 +88,7 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     crashed = int((table["status"] == "crashed").sum())
     missing = f"; none, because {crashed} crashed" if crashed else ""
     out.print(f"rates are pooled: all failures on all metres{missing}; what crashed counts as the worst elsewhere")
+    print_by_split(out, table)
 
 
 def _mean_cells(row: pd.Series[float]) -> tuple[str, str, str]:
@@ -149,8 +157,9 @@ def _cell(value: float | None) -> str:
 
 
 def kinds_of(folder: Path) -> Mapping[str, str]:
-    """The kind of event that each scenario of a run is about; empty where they are about the way."""
-    return {s.id: s.events[0].kind for s in read_suite(folder / "scenarios.json").scenarios if about_one_event(s)}
+    """What each scenario of a run is an example of: its structure, or the kind of its one event; "" for neither."""
+    scenarios = read_suite(folder / "scenarios.json").scenarios
+    return {s.id: s.structure or (s.events[0].kind if about_one_event(s) else "") for s in scenarios}
 
 
 def about_one_event(scenario: Scenario) -> bool:
@@ -159,27 +168,43 @@ def about_one_event(scenario: Scenario) -> bool:
 
 
 def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -> None:
-    """A row per kind of event: how many episodes, and their means. Nothing for fewer than two kinds."""
-    if len(set(kinds.values())) < 2:
+    """A row per kind of scenario: how many episodes, and their means. Nothing for fewer than two kinds."""
+    named = [kind for kind in dict.fromkeys(kinds.values()) if kind]
+    if len(named) < 2:
         return
-    heads = ("n", "SR", "95 % of SR", *(head for _, head in BY_KIND), "in-\nvalid", "nearest\nm", "of suc-\ncesses")
+    people = bool(table["pedestrian_distance_min_m"].notna().any())
+    columns = WITH_PEOPLE if people else WITHOUT_PEOPLE
+    heads = ("n", "SR", "95 % of SR", *(head for _, head in columns), "in-\nvalid")
     numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
-    shown = Table(Column("event", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
-    names = ("success", *(name for name, _ in BY_KIND), *NEAREST)
-    for kind in dict.fromkeys(kinds.values()):
+    shown = Table(Column("", no_wrap=True), *numbers, box=box.SIMPLE_HEAD, padding=0)
+    for kind in named:
         part = table[table["scenario"].map(kinds) == kind]
-        means = summary_of(part, names)
+        means = summary_of(part, ("success", *(name for name, _ in columns)))
         low, high, scored = (float(means[column].iloc[0]) for column in ("low", "high", "n"))
         interval = f"{low:.2f}..{high:.2f}" if scored else "-"
-        success, *shares, nearest, of_successes = (_cell(mean) for mean in means["mean"])
+        success, *rest = (_cell(mean) for mean in means["mean"])
         invalid = str((part["status"] == "invalid").sum())
-        shown.add_row(kind, f"{scored:.0f}", success, interval, *shares, invalid, nearest, of_successes)
+        shown.add_row(kind, f"{scored:.0f}", success, interval, *rest, invalid)
     out.print(shown)
-    named = ", ".join(head.replace("\n", " ") for _, head in BY_KIND)
     out.print(
-        f"n episodes that are scored; {named}: share of the event's episodes; nearest: least distance to a person's "
-        "centre, mean over episodes, and over those that succeeded"
+        "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of these; nearest: least "
+        "distance to a person's centre, mean over episodes, and over those that succeeded; SPL success by path length"
+        if people
+        else "n episodes that are scored; hit else, left lane: share of these; SPL success weighted by path length"
     )
+
+
+def print_by_split(out: Console, table: pd.DataFrame) -> None:
+    """The episodes of val and of test apart, where a run has both."""
+    if "split" not in table or table["split"].nunique() < 2:
+        return
+    names = ("success", "route_completion", "failures_per_100m")
+    columns = (Column(head, no_wrap=True) for head in ("split", "n", "SR", "RC", "FC /100m"))
+    shown = Table(*columns, box=box.SIMPLE_HEAD)
+    for split, part in table.groupby("split", sort=False):
+        rows = [_mean_cells(row) for _, row in summary_of(part, names).iterrows()]
+        shown.add_row(str(split), rows[0][2], *(f"{mean} ({interval})" for mean, interval, _ in rows))
+    out.print(shown)
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:

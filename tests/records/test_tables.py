@@ -12,11 +12,10 @@ import pytest
 from rich.console import Console
 
 from cosim.cli.tables import (
-    BY_KIND,
     COUNTS,
     LETTERS,
-    NEAREST,
     SHOWN,
+    WITH_PEOPLE,
     print_by_kind,
     print_scenarios,
     print_sheet,
@@ -66,8 +65,7 @@ def test_a_bad_run_fits_80_columns() -> None:
 def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
     """Two short episodes of two events; a collision each: 1 in the episode, 8.48 in 100 m."""
     row = dict.fromkeys(METRICS, 1.0) | {"status": "done", "ended": "failure", "reason": ""}
-    row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *BY_KIND)}  # type: ignore[dict-item]
-    row |= dict.fromkeys(NEAREST, 0.5)
+    row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *WITH_PEOPLE)}  # type: ignore[dict-item]
     row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
     names = ("ped_crossing-001", "frontal-001")
     return pd.DataFrame([row | {"scenario": n} for n in names]), {n: n.rsplit("-", 1)[0] for n in names}
@@ -98,7 +96,7 @@ def test_every_letter_and_heading_is_explained_under_its_table() -> None:
     assert text.count("/100m") >= 4 and "m/s" in text
     out, said = terminal()
     print_by_kind(out, table, kinds)
-    assert "share of the event's episodes" in " ".join(said.getvalue().split())
+    assert "share of these" in " ".join(said.getvalue().split())
 
 
 def test_the_table_by_kind_fits_80_columns() -> None:
@@ -127,3 +125,19 @@ def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
     assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 160" in str(
         unknown("scenario", "x", names)
     )
+
+
+def test_val_and_test_stand_apart() -> None:
+    """A run with both has a row for each; a run of one has none."""
+    rows = [
+        dict.fromkeys(METRICS, 1.0)
+        | {"scenario": f"s-{i}", "status": "done", "ended": "goal", "split": split, "success": float(split == "val")}
+        for i, split in enumerate(("val", "val", "test"))
+    ]
+    out, said = terminal()
+    print_table(out, pd.DataFrame(rows), 3)
+    assert re.search(r"^ +val +2 +1\.00 ", said.getvalue(), re.MULTILINE)
+    assert re.search(r"^ +test +1 +0\.00 ", said.getvalue(), re.MULTILINE) and "…" not in said.getvalue()
+    out, said = terminal()
+    print_table(out, pd.DataFrame(rows[:2]), 2)
+    assert "split" not in said.getvalue()
