@@ -199,11 +199,12 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
     if "split" not in table or table["split"].nunique() < 2:
         return
     names = ("success", "route_completion", "failures_per_100m")
-    columns = (Column(head, no_wrap=True) for head in ("split", "n", "SR", "RC", "FC /100m"))
+    columns = (Column(head, no_wrap=True) for head in ("split", "n", "SR, 95 %", "RC, 95 %", "FC /100m, 95 %"))
     shown = Table(*columns, box=box.SIMPLE_HEAD)
     for split, part in table.groupby("split", sort=False):
-        rows = [_mean_cells(row) for _, row in summary_of(part, names).iterrows()]
-        shown.add_row(str(split), rows[0][2], *(f"{mean} ({interval})" for mean, interval, _ in rows))
+        means = summary_of(part, names)
+        cells = (f"{_cell(row['mean'])} {_cell(row['low'])}..{_cell(row['high'])}" for _, row in means.iterrows())
+        shown.add_row(str(split), f"{means['n'].iloc[0]:.0f}", *cells)
     out.print(shown)
 
 
