@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from functools import cache
 
 from cosim.core.state import STILL, Command
-from cosim.episode.ports import Manifest, Observation
+from cosim.episode.ports import CameraSpec, Manifest, Observation
 from cosim.spec.pseudonym import pseudonym_of
+from cosim.spec.robot import Mount
 from cosim.spec.scenario import Scenario
 from scenarios.catalog import SUITES, load_suite
 
@@ -104,6 +105,18 @@ class Counter(NameReader):
 
     def reset(self, episode_id: str, seed: int) -> None:
         self.known = next(self.coming)
+
+
+class FarEye:
+    """Sees by a camera 6 m before it and 18 m above the ground, which no robot carries."""
+
+    manifest = Manifest("far-eye", camera=CameraSpec(64, 64, mount=Mount((6.0, 0.0, 18.0), 80.0)))
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(_PACE_MPS, 0.0)
 
 
 @cache

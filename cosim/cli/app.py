@@ -41,6 +41,7 @@ SHARED_HELP = (
 SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
+OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 
 
@@ -102,6 +103,7 @@ def run_command(
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    own_camera: Annotated[bool, typer.Option("--own-camera", help=OWN_CAMERA_HELP)] = False,
     live: Annotated[
         str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
     ] = None,
@@ -179,6 +181,7 @@ def run_command(
     options = EpisodeOptions(
         seed=run_seed,
         robot=robot,
+        own_camera=own_camera,
         suite_hash=whole.content_hash,
         camera=drawn_by,
         frames_every_s=frames,
@@ -262,6 +265,8 @@ def list_all(
             out.print(
                 f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at {one.w_max_radps:g} rad/s"
             )
+            for name, mount in one.mounts.items():
+                out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
         for name, make in POLICIES.items():
             out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
         return

@@ -68,8 +68,14 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
     for _, row in table.iterrows():
         counts = "/".join("-" if pd.isna(row[name]) else f"{row[name]:.0f}" for name, _ in COUNTS)
         ended = row["ended"] if row["status"] == "done" else row["status"]
-        shown.add_row(row["scenario"], ended, *(_cell(row[name]) for name, _ in SHOWN), counts)
+        shown.add_row(
+            row["scenario"] + "*" * bool(row.get("nonstandard")),
+            ended,
+            *(_cell(row[name]) for name, _ in SHOWN),
+            counts,
+        )
     out.print(shown)
+    print_terms(out, table)
     counted = "/".join(name for _, name in COUNTS)
     out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
     print_means(out, table)
@@ -107,6 +113,17 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
         out.print(f"{row['status']} {row['scenario']}: {row['reason']}", soft_wrap=True, markup=False, highlight=False)
     if reason := not_to_be_quoted(table, scheduled):
         out.print(f"not to be quoted: {reason}", soft_wrap=True, highlight=False)
+
+
+def print_terms(out: Console, table: pd.DataFrame) -> None:
+    """What the policy saw by, how its waypoints were followed, the run's seed; and what is not as the robot has it."""
+    named = ["camera", "rate_hz", "waypoints", "run_seed", "nonstandard"]
+    if not {*named} <= set(table.columns):
+        return
+    for camera, rate_hz, waypoints, seed, odd in table[named].drop_duplicates().itertuples(index=False):
+        out.print(f"camera {camera}, at {rate_hz:g} Hz; {waypoints}; seed {seed}", highlight=False, markup=False)
+        if odd:
+            out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
 
 
 def print_scenarios(out: Console, suite: Suite) -> None:

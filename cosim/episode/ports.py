@@ -55,10 +55,13 @@ class Lens:
 class CameraSpec:
     """A policy's camera: size in pixels, vertical field of view in degrees, and where it sits.
 
-    mount: the name of one of the robot's mounts, which every robot has elsewhere, or a place on any robot.
+    mount: the name of one of the robot's mounts, which every robot has elsewhere and whose limits hold for size, field
+    of view and rate. A place of one's own, or what is beyond the limits, needs `EpisodeOptions.own_camera`.
+    crop: (x0, y0, x1, y1) in pixels of the whole picture: the policy gets its columns x0 to x1 and rows y0 to y1 alone,
+    from the upper left corner, without x1 and y1. Raises SpecError where that is no part of the picture.
 
-    >>> CameraSpec(width=512, height=288, fov_deg=60.0).width
-    512
+    >>> CameraSpec(width=512, height=288, fov_deg=60.0, crop=(0, 88, 512, 288)).size
+    (512, 200)
     """
 
     width: int = 96
@@ -66,6 +69,32 @@ class CameraSpec:
     fov_deg: float = 75.0
     mount: str | Mount = "front"
     lens: Lens = Lens()
+    crop: tuple[int, int, int, int] | None = None
+
+    def __post_init__(self) -> None:
+        if self.crop is None:
+            return
+        object.__setattr__(self, "crop", tuple(self.crop))
+        x0, y0, x1, y1 = self.crop if len(self.crop) == 4 else (0, 0, 0, 0)
+        if not (0 <= x0 < x1 <= self.width and 0 <= y0 < y1 <= self.height):
+            raise SpecError(
+                f"camera crop must be (x0, y0, x1, y1) within {self.width} x {self.height} pixels, x0 < x1 and "
+                f"y0 < y1, not {self.crop}"
+            )
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of what the policy gets."""
+        x0, y0, x1, y1 = self.crop or (0, 0, self.width, self.height)
+        return x1 - x0, y1 - y0
+
+    @property
+    def in_words(self) -> str:
+        """As tables tell it."""
+        own = "own mount" if isinstance(self.mount, Mount) else self.mount
+        crop = "" if self.crop is None else ", crop " + " ".join(map(str, self.crop))
+        lens = "" if self.lens == Lens() else ", lens"
+        return f"{own}, {self.width} x {self.height} px, {self.fov_deg:g} deg{crop}{lens}"
 
     def on(self, robot: Robot) -> Mount:
         """Where it sits on a robot. Raises UsageError, listing the robot's mounts, if it has none of that name."""

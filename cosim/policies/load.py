@@ -118,8 +118,11 @@ def _wrong_camera(camera: CameraSpec) -> str:
     if not 0.0 < camera.fov_deg < 180.0:
         return f"camera fov_deg must be between 0 and 180, not {camera.fov_deg}"
     mount = camera.mount
-    if not isinstance(mount, str) and not all(map(math.isfinite, (*mount.at_m, mount.pitch_down_deg))):
-        return f"camera mount at_m and pitch_down_deg must be finite, not {mount.at_m}, {mount.pitch_down_deg}"
+    if not isinstance(mount, str) and not all(
+        map(math.isfinite, (*mount.at_m, mount.pitch_down_deg, mount.yaw_left_deg))
+    ):
+        angles = f"{mount.pitch_down_deg}, {mount.yaw_left_deg}"
+        return f"camera mount at_m, pitch_down_deg and yaw_left_deg must be finite, not {mount.at_m}, {angles}"
     return ""
 
 

@@ -17,14 +17,16 @@ from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
+from cosim.episode.camera_rules import nonstandard
 from cosim.episode.log import Log
-from cosim.episode.ports import Manifest, WaypointRule
+from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
 from cosim.episode.step import Step
 from cosim.judge.nearness import nearness
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
 from cosim.spec.pseudonym import pseudonym_of
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
@@ -86,6 +88,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     policy_version: str
     policy_source: str = ""
     waypoints: WaypointRule = WaypointRule()
+    camera: CameraSpec | None = None
+    rate_hz: float = 4.0
+    nonstandard: str = ""
     goal_protocol: str
     renderer: str
     versions: dict[str, str]
@@ -150,6 +155,9 @@ def begun(
         policy_version=manifest.version,
         policy_source=policy_source,
         waypoints=manifest.waypoints,
+        camera=manifest.camera,
+        rate_hz=manifest.rate_hz,
+        nonstandard=nonstandard(manifest, robot_called(scenario.robot)),
         goal_protocol="route" if manifest.privileged else "none",
         renderer=NO_RENDERER,
         versions=versions(),

@@ -27,7 +27,7 @@ import pandas as pd
 
 from cosim.core.errors import MachineError, RunError, unknown, unwritable
 from cosim.core.whole_file import write_whole
-from cosim.episode.ports import WaypointRule
+from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
 from cosim.spec.scenario import Suite, write_suite
@@ -43,6 +43,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
     "versions", "renderer", "counterfactual", "waypoints", "seed",
+    "camera", "rate_hz",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -63,6 +64,8 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_version: str
     policy_source: str = ""
     waypoints: WaypointRule = WaypointRule()
+    camera: CameraSpec | None = None
+    rate_hz: float = 4.0
     seed: int = 0
     scenarios: tuple[str, ...]
     versions: dict[str, str]

@@ -36,11 +36,12 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
     (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
     0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. suite_hash, policy_source: of the suite
-    that the scenario is of and of the file of the policy, for the record. camera: what draws pictures. frames_every_s:
-    keep a camera frame every so many seconds, 0 for none. live: where it is on the air meanwhile. director: where its
-    event pedestrians are decided, when not beside it. counterfactual: compare it with its street without the robot.
-    injections: pedestrians that were injected into the episode that this one replays. renderer: what draws for the
-    policy in place of a camera of its own.
+    that the scenario is of and of the file of the policy, for the record. own_camera: the policy may see by a camera
+    that the robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what
+    draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it is on the air
+    meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual: compare it with
+    its street without the robot. injections: pedestrians that were injected into the episode that this one replays.
+    renderer: what draws for the policy in place of a camera of its own.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -50,6 +51,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     robot: str = ""
     suite_hash: str = ""
     policy_source: str = ""
+    own_camera: bool = False
     camera: CameraChoice = "auto"
     frames_every_s: float = 0.0
     live: Live | None = None

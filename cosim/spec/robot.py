@@ -34,7 +34,11 @@ class Skid:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Where a camera sits: (x, y, z) in the base frame, metres, and how far it looks down.
+    """Where a camera sits, and what it can be there.
+
+    at_m: (x, y, z) in the base frame, metres. pitch_down_deg, yaw_left_deg: how far it looks down, and to the left of
+    ahead. fov_deg: the least and the largest vertical field of view; most_px: the largest (width, height) in pixels;
+    most_hz: the most pictures a second.
 
     >>> Mount((0.3, 0.0, 0.62), pitch_down_deg=10.0).at_m[2]
     0.62
@@ -42,6 +46,21 @@ class Mount:
 
     at_m: tuple[float, float, float]
     pitch_down_deg: float = 0.0
+    yaw_left_deg: float = 0.0
+    fov_deg: tuple[float, float] = (20.0, 120.0)
+    most_px: tuple[int, int] = (1280, 960)
+    most_hz: float = 20.0
+
+    @property
+    def in_words(self) -> str:
+        """Where it is, and its limits."""
+        at = ", ".join(f"{m:g}" for m in self.at_m)
+        side = f", {abs(self.yaw_left_deg):g} deg to the {'left' if self.yaw_left_deg > 0 else 'right'}"
+        return (
+            f"at ({at}) m, {self.pitch_down_deg:g} deg down{side if self.yaw_left_deg else ''}; up to "
+            f"{self.most_px[0]} x {self.most_px[1]} px, {self.fov_deg[0]:g} to {self.fov_deg[1]:g} deg, "
+            f"{self.most_hz:g} Hz"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,9 +68,10 @@ class Robot:
     """A robot. length_m, width_m, height_m: of the box around its collision body, in whose middle the base frame lies.
 
     urdf: a file in `physics/robots`, or an absolute path. mounts: its cameras' places by name; a policy's camera sits
-    at "front" unless it says otherwise. cruise_mps: the pace at which it travels; v_max_mps, w_max_radps: the most that
-    a command can ask of it, as magnitudes; acceleration_mps2, acceleration_radps2: of its motors' ramps. drive: how it
-    moves; one that does not skid needs a class beside `Skid`, and one beside `physics.world.drive.SkidDrive`.
+    at "front", where every robot has one, unless it says otherwise. cruise_mps: the pace at which it travels;
+    v_max_mps, w_max_radps: the most that a command can ask of it, as magnitudes; acceleration_mps2,
+    acceleration_radps2: of its motors' ramps. drive: how it moves; one that does not skid needs a class beside `Skid`,
+    and one beside `physics.world.drive.SkidDrive`.
 
     >>> robot_called("scout").footprint_m
     (0.5, 0.4)
@@ -91,7 +111,13 @@ COURIER = Robot(
     height_m=0.50,
     com_height_m=0.20,
     drive=Skid(wheel_radius_m=0.12, span_m=(0.42, 0.46), torque_nm=7.0),
-    mounts={"front": Mount((0.30, 0.0, 0.62), 10.0)},
+    mounts={
+        "front": Mount((0.30, 0.0, 0.62), 10.0),
+        "low": Mount((0.33, 0.0, 0.30), most_hz=10.0),
+        "left": Mount((0.10, 0.25, 0.58), 10.0, 60.0, most_hz=10.0),
+        "right": Mount((0.10, -0.25, 0.58), 10.0, -60.0, most_hz=10.0),
+        "mast": Mount((-0.28, 0.0, 1.20), 15.0, fov_deg=(20.0, 90.0)),
+    },
     cruise_mps=1.5,
     v_max_mps=2.5,
     w_max_radps=0.65,
@@ -107,7 +133,12 @@ SCOUT = Robot(
     height_m=0.36,
     com_height_m=0.14,
     drive=Skid(wheel_radius_m=0.10, span_m=(0.30, 0.34), torque_nm=4.0),
-    mounts={"front": Mount((0.22, 0.0, 0.40), 6.0)},
+    mounts={
+        "front": Mount((0.22, 0.0, 0.40), 6.0),
+        "left": Mount((0.08, 0.18, 0.36), 6.0, 60.0, most_hz=10.0),
+        "right": Mount((0.08, -0.18, 0.36), 6.0, -60.0, most_hz=10.0),
+        "mast": Mount((-0.20, 0.0, 0.85), 12.0, fov_deg=(20.0, 90.0)),
+    },
     cruise_mps=2.0,
     v_max_mps=2.0,
     w_max_radps=1.2,

@@ -58,8 +58,16 @@ class WorldCamera(ABC):
         return self._drawn(shot(eye_m, target_m, size, fov_deg), street, robot, body=True)
 
     def through_lens(self, frame: Frame, robot: RobotState, street: Street) -> Frame:
-        """What the lens makes of a picture as the robot's pinhole camera would see it."""
-        return through(self.spec, frame, robot, self._world.surface.seed, street.tick)
+        """What the lens makes of a picture as the robot's pinhole camera would see it; of that what the policy gets."""
+        whole = through(self.spec, frame, robot, self._world.surface.seed, street.tick)
+        return whole if self.spec.crop is None else _cropped(whole, *self.spec.crop)
 
     def _mounted(self, robot: RobotState) -> Shot:
         return robot_shot(self._world.surface, self._world.robot, self._pinhole, robot)
+
+
+def _cropped(frame: Frame, x0: int, y0: int, x1: int, y1: int) -> Frame:
+    """A part of a picture, and of its labels and depth."""
+    part = slice(y0, y1), slice(x0, x1)
+    labels = None if frame.labels is None else frame.labels[part].copy()
+    return Frame(frame.rgb[part].copy(), labels, None if frame.depth is None else frame.depth[part].copy())

@@ -207,11 +207,14 @@ def _flows(spec: CameraSpec) -> tuple[Map, Map]:
     """
     x, y = (m.astype(float) for m in _rays(spec))
     assert isinstance(spec.mount, Mount), "a camera's mount is known once it sits on its robot: CameraSpec.on"
-    down, (x_m, y_m, z_m) = math.radians(spec.mount.pitch_down_deg), spec.mount.at_m
+    down, side = math.radians(spec.mount.pitch_down_deg), math.radians(spec.mount.yaw_left_deg)
+    x_m, y_m, z_m = spec.mount.at_m
     near = np.maximum((y * math.cos(down) + math.sin(down)) / max(z_m, 0.05), 1.0 / _FAR_M)
-    ahead = np.array([0.0, -math.sin(down), math.cos(down)])
+    level, right = np.array([0.0, -math.sin(down), math.cos(down)]), np.array([1.0, 0.0, 0.0])
+    ahead = math.cos(side) * level + math.sin(side) * right
+    left = math.sin(side) * level - math.cos(side) * right
     up = np.array([0.0, -math.cos(down), -math.sin(down)])
-    swing = -y_m * ahead + np.array([-x_m, 0.0, 0.0])
+    swing = -y_m * ahead + x_m * left
     rays = np.stack([x, y, np.ones_like(x)], axis=-1)
     flows = []
     for speed, turn in ((ahead, np.zeros(3)), (swing, up)):

@@ -114,11 +114,11 @@ def robot_shot(surface: Surface, model: Robot, spec: CameraSpec, robot: RobotSta
     """What a robot's camera looks at from its mount; it leans with the ground."""
     turn, mount = _attitude(surface, model, robot), spec.on(model)
     x, y, z = mount.at_m
-    down = math.radians(mount.pitch_down_deg)
-    ahead, below = math.cos(down), math.sin(down)
+    down, left = math.radians(mount.pitch_down_deg), math.radians(mount.yaw_left_deg)
+    ahead, aside, below = math.cos(down) * math.cos(left), math.cos(down) * math.sin(left), math.sin(down)
     foot = robot.pose.x_m, robot.pose.y_m, robot.z_m
     eye = np.array([at + a * x + b * y + c * z for at, (a, b, c) in zip(foot, turn, strict=True)])
-    way = np.array([a * ahead - c * below for a, _, c in turn])
+    way = np.array([a * ahead + b * aside - c * below for a, b, c in turn])
     return Shot(eye, eye + way, (spec.width, spec.height), spec.fov_deg)
 
 

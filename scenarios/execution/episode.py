@@ -24,6 +24,7 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, UsageError
 from cosim.core.state import STILL, Frame
+from cosim.episode.camera_rules import check_camera
 from cosim.episode.control import command_of
 from cosim.episode.log import Log
 from cosim.episode.loop import Moment, after, begin, tick
@@ -34,6 +35,7 @@ from cosim.records.record import Record, begun
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.pseudonym import pseudonym_of
+from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.on_air import OnAir
@@ -56,8 +58,8 @@ class Episode:
     when it stands still. through: may put stopwatches or stand-ins before the engines, which have started and not
     begun. kinds: the table of events that there may be.
 
-    Raises UsageError when it is used out of turn, PolicyError for an answer that is no command, EngineError when an
-    engine fails or runs already, and what its place raises.
+    Raises UsageError for a camera that the robot does not have and when it is used out of turn, PolicyError for an
+    answer that is no command, EngineError when an engine fails or runs already, and what its place raises.
 
     >>> from cosim import load_policy, load_suite
     >>> policy = load_policy("straight")
@@ -83,6 +85,7 @@ class Episode:
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
         self.manifest, self.options = manifest, options
+        check_camera(manifest, robot_called(scenario.robot), options.own_camera)
         run_seed = 0 if options.seed is None else options.seed
         self.id, self.seed = pseudonym_of(run_seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)

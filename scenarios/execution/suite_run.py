@@ -12,6 +12,7 @@ import pandas as pd
 
 from cosim.core.errors import UsageError
 from cosim.core.versions import versions
+from cosim.episode.camera_rules import check_camera
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
@@ -98,11 +99,11 @@ def run_spec(
     whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions, shared: bool = False
 ) -> RunSpec:
     """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it. Raises UsageError when
-    a robot has no mount for its camera."""
+    a robot has no such camera, unless one of its own was asked for."""
     manifest, robots = driver.manifest, [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
-            manifest.camera.on(robot)
+            check_camera(manifest, robot, options.own_camera)
     return RunSpec(
         suite=whole.name,
         robots={robot.name: hash_of_robot(robot) for robot in robots},
@@ -113,6 +114,8 @@ def run_spec(
         policy_version=manifest.version,
         policy_source=driver.source_hash,
         waypoints=manifest.waypoints,
+        camera=manifest.camera,
+        rate_hz=manifest.rate_hz,
         seed=0 if options.seed is None else options.seed,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),

@@ -86,7 +86,7 @@ def serve_pictures(pipe: int, asked: int, listening: int) -> None:
             from physics.cameras.choice import renderer_of
             from physics.cameras.gl.atlas import Atlas
 
-            atlas, drawn_by, size = stack.enter_context(Atlas(spec)), renderer_of("gl"), (spec.width, spec.height)
+            atlas, drawn_by, size = stack.enter_context(Atlas(spec)), renderer_of("gl"), spec.size
         welcome = Welcome(asked_for.number, drawn_by, size)
         _Renderer(welcome, atlas, driver, partial(say, Ready())).serve(socket.socket(fileno=listening), pipe)
 

@@ -58,9 +58,13 @@ BAD = {
     "waypoints-as-number": (GOOD.replace("{fields}", ", waypoints=2"), "its manifest: Expected `object`, got `int`"),
     "no-pixels": (GOOD.replace("{fields}", ", camera=CameraSpec(0, 96)"), "sides of 1 to 4096 pixels, not 0 x 96"),
     "fish-eye": (GOOD.replace("{fields}", ", camera=CameraSpec(fov_deg=190)"), "fov_deg must be between 0 and 180"),
+    "crop-beyond": (
+        GOOD.replace("{fields}", ", camera=CameraSpec(96, 96, crop=(0, 0, 97, 96))"),
+        "camera crop must be (x0, y0, x1, y1) within 96 x 96 pixels, x0 < x1 and y0 < y1, not (0, 0, 97, 96)",
+    ),
     "lost-mount": (
         GOOD.replace("{fields}", ", camera=CameraSpec(mount=Mount((0.0, float('inf'), 0.0)))"),
-        "mount at_m and pitch_down_deg must be finite",
+        "mount at_m, pitch_down_deg and yaw_left_deg must be finite",
     ),
 }
 

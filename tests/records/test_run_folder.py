@@ -15,7 +15,7 @@ import pytest
 
 from cosim.core.errors import RunError, UsageError
 from cosim.episode.log import Log
-from cosim.episode.ports import WaypointRule
+from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.judge.metrics import METRICS
 from cosim.records.record import Record
 from cosim.records.results import summary_of, table_of, table_row
@@ -113,6 +113,9 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("versions", {"numpy": "1"}),
         ("counterfactual", True),
         ("waypoints", WaypointRule(rule="atan2")),
+        ("seed", 8),
+        ("camera", CameraSpec(512, 288)),
+        ("rate_hz", 5.0),
     ],
 )
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:
@@ -135,6 +138,22 @@ def test_another_waypoint_rule_is_told_in_words(tmp_path: Path) -> None:
         "its waypoints is waypoint 2, units of 1 m, in 0.25 s, shipped, now asked for is waypoint 0, units of 1 m, "
         "in 0.2 s, atan2. Resume with the same command"
     ) in str(caught.value)
+
+
+def test_another_camera_is_told_in_words(tmp_path: Path) -> None:
+    """Mount, size, field of view and crop of both."""
+    spec = msgspec.structs.replace(SPEC, camera=CameraSpec(512, 288, 60.0))
+    with RunFolder.create(tmp_path / "run", spec, SUITE):
+        pass
+    other = msgspec.structs.replace(SPEC, camera=CameraSpec(512, 288, 60.0, "mast", crop=(0, 88, 512, 288)))
+    with pytest.raises(RunError) as caught:
+        RunFolder.resume(tmp_path / "run", other)
+    assert (
+        "its camera is front, 512 x 288 px, 60 deg, now asked for is mast, 512 x 288 px, 60 deg, crop 0 88 512 288. "
+        "Resume with the same command"
+    ) in str(caught.value)
+    with RunFolder.resume(tmp_path / "run", spec) as again:
+        assert again.spec.camera == spec.camera
 
 
 def test_every_row_tells_how_waypoints_were_followed(tmp_path: Path) -> None:

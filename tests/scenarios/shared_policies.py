@@ -21,9 +21,10 @@ NOTES = "SHARED_NOTES"
 
 
 class Seeing:
-    """Drives by the brightness of its picture: another bit in it, another state hash."""
+    """Drives by the brightness of its picture, a part of 48 x 32 pixels of a whole one: another bit in it, another
+    state hash."""
 
-    manifest = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(48, 32))
+    manifest = Manifest("seeing", rate_hz=4.0, camera=CameraSpec(64, 40, crop=(8, 4, 56, 36)))
 
     def reset(self, episode_id: str, seed: int) -> None:
         """Nothing to forget."""

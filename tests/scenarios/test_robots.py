@@ -56,7 +56,7 @@ BARROW = Robot(
     height_m=0.6,
     com_height_m=0.25,
     drive=Skid(0.15, (0.6, 0.66), 15.0, left=("fl", "rl"), right=("fr", "rr")),
-    mounts={"front": Mount((0.45, 0.0, 0.9), 5.0), "mast": Mount((0.0, 0.0, 1.4), 20.0)},
+    mounts={"front": Mount((0.45, 0.0, 0.9), 5.0), "rail": Mount((0.0, 0.0, 1.4), 20.0)},
     cruise_mps=0.8,
     v_max_mps=1.0,
     w_max_radps=0.4,
@@ -95,7 +95,7 @@ def barrow(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Robot:
 class Seeing:
     """A policy whose camera sits on a mast."""
 
-    manifest = Manifest("seeing", camera=CameraSpec(mount="mast"))
+    manifest = Manifest("seeing", camera=CameraSpec(mount="rail"))
 
     def reset(self, scenario_id: str, seed: int) -> None: ...
 
@@ -191,18 +191,34 @@ def test_a_camera_sits_where_its_robot_carries_it(barrow: Robot) -> None:
     for robot in (COURIER, SCOUT, barrow):
         eye_m = robot_shot(surface, robot, CameraSpec(), state).eye_m - (-40.0, 100.0, 0.0)
         assert eye_m == pytest.approx(robot.mounts["front"].at_m)
-    assert CameraSpec(mount="mast").on(barrow) == Mount((0.0, 0.0, 1.4), 20.0)
+    assert CameraSpec(mount="rail").on(barrow) == Mount((0.0, 0.0, 1.4), 20.0)
     own = Mount((0.1, 0.0, 0.3), 5.0)
     assert CameraSpec(mount=own).on(barrow) == CameraSpec(mount=own).on(SCOUT) == own
-    with pytest.raises(UsageError, match="unknown camera mount of robot 'scout' 'mast'"):
-        CameraSpec(mount="mast").on(SCOUT)
+    with pytest.raises(UsageError, match="unknown camera mount of robot 'scout' 'rail'"):
+        CameraSpec(mount="rail").on(SCOUT)
+
+
+@pytest.mark.parametrize("robot", ROBOTS.values(), ids=lambda robot: robot.name)
+def test_the_mounts_of_a_robot_are_on_it(robot: Robot) -> None:
+    """Every robot has "front"; each mount is over the robot's outline and within reach of a mast, and one on the left
+    looks to the left: its eye and its heading are those of the row."""
+    surface, state = StreetSurface(tiny_map(), 1), RobotState(Pose(-40.0, 100.0, 0.3))
+    assert "front" in robot.mounts
+    for name, mount in robot.mounts.items():
+        x_m, y_m, z_m = mount.at_m
+        assert abs(x_m) <= robot.length_m / 2 and abs(y_m) <= robot.width_m / 2 and 0.1 < z_m <= 1.2, name
+        taken = robot_shot(surface, robot, CameraSpec(mount=name), state)
+        assert taken.view.heading_rad == pytest.approx(0.3 + math.radians(mount.yaw_left_deg)), name
+        assert math.degrees(taken.steep_rad) == pytest.approx(mount.pitch_down_deg), name
+        assert (mount.yaw_left_deg > 0) == (y_m > 0) == (name == "left")
 
 
 def test_a_mount_that_the_robot_lacks_is_refused_before_anything_runs(barrow: Robot, tmp_path: Path) -> None:
     """No episode crashes over it, no folder is made; with the robot that has it the run may begin."""
     policy = Seeing()
     for name in ("courier", "scout"):
-        said = f"unknown camera mount of robot '{name}' 'mast'. Valid choices: front."
+        mounts = ", ".join(sorted(ROBOTS[name].mounts))
+        said = f"unknown camera mount of robot '{name}' 'rail'. Valid choices: {mounts}."
         with pytest.raises(UsageError, match=re.escape(said)):
             run("reactive", policy, episodes=1, out=tmp_path / "run", options=EpisodeOptions(robot=name))
     assert not (tmp_path / "run").exists()
