@@ -159,9 +159,13 @@ def _run(pieces: Sequence[_Piece], folder: Path, jobs: int, tries: int) -> Itera
                 if worker.restarts < most and any(slot.name in open_slots for slot in worker.piece.slots):
                     waiting.insert(0, (worker.piece, worker.restarts + 1))
     finally:
+        # Who stops the build does not use up a candidate.
         for worker in working:
             worker.process.kill()
             worker.process.join()
+            for slot in worker.piece.slots:
+                if (tried := _tried(folder, slot.name)).begun:
+                    _note(folder, slot, _Tried(tried.dropped, tried.begun - 1))
 
 
 def _look_after(worker: _Worker, folder: Path) -> None:
