@@ -16,6 +16,7 @@ from cosim.spec.robot import Robot
 
 STEP_S: Final = 0.2
 STEPS: Final = 20
+STEP_TIMES_S: Final = STEP_S * np.arange(1, STEPS + 1)
 _GAIN_PER_S: Final = 2.4
 _LOOK_M: Final = 1.0
 TURN_FIRST_RAD: Final = 1.1
@@ -72,8 +73,8 @@ class Way:
 
 
 class Ahead(NamedTuple):
-    """What becomes of K plans at STEPS times. pose: (STEPS, 3, K) x, y, heading; s_m: (STEPS, K); command: (2, K) v and
-    w to be given now."""
+    """What becomes of K plans at STEPS times. pose: (STEPS, 3, K) x, y, heading; s_m: (STEPS, K); command:
+    (2, K) v and w to be given now. Who waits does not turn either."""
 
     pose: Floats
     s_m: Floats
@@ -87,6 +88,7 @@ def foresee(way: Way, plans: Plans, robot: Robot, pose: Pose, s_m: float, speeds
     x, y, heading = (np.full(count, value) for value in pose)
     along, v, w = (np.full(count, value) for value in (s_m, *speeds))
     poses, arcs, command = np.empty((STEPS, 3, count)), np.empty((STEPS, count)), np.empty((2, count))
+    turns = plans.speed_mps > 0.0
     for k in range(STEPS):
         x_0, y_0, left_x, left_y = way.at(along)
         x_1, y_1, there_x, there_y = way.at(along, _LOOK_CELLS)
@@ -98,7 +100,7 @@ def foresee(way: Way, plans: Plans, robot: Robot, pose: Pose, s_m: float, speeds
         bearing = wrap_angles(np.arctan2(y_1 + lane * there_y - y, x_1 + lane * there_x - x) - heading)
         slowed = np.maximum(1.0 - np.abs(bearing) / TURN_FIRST_RAD, 0.05)
         v_goal = plans.speed_mps * np.minimum(slowed * 1.35, 1.0)
-        w_goal = np.minimum(np.maximum(_GAIN_PER_S * bearing, -robot.w_max_radps), robot.w_max_radps)
+        w_goal = turns * np.minimum(np.maximum(_GAIN_PER_S * bearing, -robot.w_max_radps), robot.w_max_radps)
         if k == 0:
             command[:] = v_goal, w_goal
         v = v + np.minimum(np.maximum(v_goal - v, -v_step), v_step)

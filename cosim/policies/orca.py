@@ -2,7 +2,7 @@
 
 It knows what no camera shows: where everybody is and how they walk, the free ground, signals and when they change; and
 what people are doing, which tells it who talks, who queues and who holds out a stopping hand. How people will go on it
-does not know: they are taken to walk on as they do.
+does not know: they are taken to walk on as they do (`encounters`).
 
 The route is led round what stands on it for good (`guide`). Each time it acts:
 
@@ -12,7 +12,8 @@ The route is led round what stands on it for good (`guide`). Each time it acts:
 3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to that velocity
    while the body stays clear of everybody and on free ground (`clearance`).
 
-Red signals, cars near a crossing and a stopping hand limit the speed so that it comes to rest before them.
+Red signals, cars near a crossing and a stopping hand limit the speed so that it comes to rest before them; for who
+walks straight at it from near it stands, since people go round a robot that does.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
 from cosim.policies.body import BodyDisks
 from cosim.policies.clearance import Clearance
-from cosim.policies.foresight import STEP_S, STEPS, Ahead, Plans, Way, foresee
+from cosim.policies.encounters import Yielding, bodies, gaps_to_people, walks
+from cosim.policies.foresight import STEP_S, STEP_TIMES_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, who_stands
 from cosim.policies.guide import Guide
 from cosim.policies.route import CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
@@ -43,23 +45,17 @@ MANOEUVRES: Final = ((0.0, 0.35), (0.0, 0.9), (0.6, 0.9), (1.2, 0.9))
 OUT_OF_A_NOOK: Final = (0.0, 3.0)
 """The same of turning nearly on the spot first, at the slowest speed: past somebody whom it stands right before."""
 
-_TIMES_S: Final = STEP_S * np.arange(1, STEPS + 1)
-
 _HORIZON_S: Final = 3.0
 """ORCA's tau."""
 
 _CLEARANCE_M: Final = 0.3
 _TIGHT_M: Final = 0.12
-LATER_M_PER_S: Final = 0.04
-"""What is foreseen later may come out otherwise: so much nearer a plan may come for each second ahead."""
 _NEARNESS_COST: Final = 15.0
 TOUCH_COST: Final = 60.0
 """m/s given up per metre nearer than the clearance, and nearer than a hand's breadth."""
 CAR_DEEP_M: Final = 0.5
 LANE_COST: Final = 0.25
 _CHANGE_COST: Final = 0.4
-FOLLOWED: Final = 0.6
-"""Those who walk the robot's way may stop: they are foreseen so much slower than they walk."""
 EDGE_COST: Final = 6.0
 """m/s given up when all of a plan lies outside the walkable area."""
 _EDGE_M: Final = 0.06
@@ -117,6 +113,7 @@ class Orca:
     def reset(self, episode_id: str, seed: int) -> None:
         self._lane_m = 0.0
         self._stuck_s = 0.0
+        self._yielding = Yielding()
         self._led_anew_s = _LED_ANEW_S
         self._stuck_at = (math.inf, math.inf)
         self._last_time_s = 0.0
@@ -133,6 +130,8 @@ class Orca:
         self._last_time_s = observation.time_s
         robot = observation.robot
         limit_mps = min(crossing_limit(known, robot), stop_limit(known), speeds_of(robot)[0])
+        if self._yielding.waits(known, observation.time_s):
+            limit_mps = 0.0
         x_m, y_m, _ = known.robot.pose
         self._stuck_s += dt_s
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
@@ -145,7 +144,9 @@ class Orca:
         aim_m = lane_past(known, disks, here, ends, self._lane_m)
         wished = bent(known, robot, here, people, aim_m, limit_mps)
         plans = all_plans(lanes_inside(here), [min(speed, limit_mps) for speed in speeds_of(robot)])
-        ahead, gaps = foreseen(known, robot, here, plans, people, ends)
+        state = known.robot
+        ahead = foresee(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
+        gaps = gaps_to_people(known, robot, ahead, people, ends)
         weights = PATIENT if self._stuck_s < _PATIENCE_S else STUCK
         out, deeper = off_ground(known, here, ahead, robot.length_m * 2 / 7)
         cost = weights.edge * out + _SOLID_COST * deeper + _NEARNESS_COST * car_nearness(known, disks, ahead)
@@ -211,22 +212,6 @@ def nearby(known: Privileged) -> People:
     behind = (forward < -0.3) & ((np.abs(left) < 0.6) | (forward < -2.5))
     near = (np.hypot(offset[:, 0], offset[:, 1]) < 1.5 * SEEN_M) & ~behind
     return people.only(np.flatnonzero(near))
-
-
-def walks(people: People) -> Floats:
-    """(N, 2) m/s: how they walk; those who stand do not."""
-    speed = np.where(who_stands(people), 0.0, people.speed)
-    velocity: Floats = speed[:, None] * np.column_stack([np.cos(people.heading), np.sin(people.heading)])
-    return velocity
-
-
-def followed(known: Privileged, people: People) -> Floats:
-    """`walks`, but slower for those ahead who walk the robot's way."""
-    pose, velocity = known.robot.pose, walks(people)
-    forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
-    same = ((people.xy - pose.xy) @ forward > 0.3) & (velocity @ forward > 0.7 * people.speed)
-    slower: Floats = np.where(same[:, None], FOLLOWED * velocity, velocity)
-    return slower
 
 
 def stop_limit(known: Privileged) -> float:
@@ -297,37 +282,6 @@ def all_plans(lanes: Floats, speeds: Sequence[float]) -> Plans:
     return Plans(*np.array(rows).T)
 
 
-def foreseen(
-    known: Privileged, robot: Robot, here: Here, plans: Plans, people: People, ends: Floats
-) -> tuple[Ahead, Floats]:
-    """What becomes of the plans, and the smallest gap (K,) m of each between the body and anybody."""
-    state, disks = known.robot, BodyDisks.of(robot)
-    ahead = foresee(here.way, plans, robot, state.pose, here.s_m, (state.v_mps, state.w_radps))
-    moving = ~who_stands(people)
-    xy = people.xy[moving] + _TIMES_S[:, None, None] * followed(known, people)[moving]
-    reach_m = disks.around_m + PERSON_RADIUS_M + _CLEARANCE_M + speeds_of(robot)[0] * _TIMES_S
-    away_m = np.linalg.norm(xy - state.pose.xy, axis=-1)
-    xy = xy[:, (away_m < reach_m[:, None]).any(axis=0)]
-    ends = ends[distances(state.pose.xy, ends) < reach_m[-1]]
-    squared = np.full((*ahead.s_m.shape, 0), np.inf)
-    for x, y in bodies(ahead, disks):
-        if xy.shape[1]:
-            dx, dy = xy[:, None, :, 0] - x[..., None], xy[:, None, :, 1] - y[..., None]
-            squared = np.concatenate([squared, (dx * dx + dy * dy).min(axis=-1)[..., None]], axis=-1)
-        if len(ends):
-            apart = distances(np.stack([x, y], axis=-1), ends).min(axis=-1)
-            squared = np.concatenate([squared, (apart * apart)[..., None]], axis=-1)
-    gaps = np.sqrt(squared.min(axis=-1, initial=np.inf)) - PERSON_RADIUS_M - disks.radius_m
-    return ahead, (gaps + LATER_M_PER_S * _TIMES_S[:, None]).min(axis=0)
-
-
-def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """x and y, (STEPS, K) m each, of the middles of the two disks of the body."""
-    x, y, heading = ahead.pose[:, 0], ahead.pose[:, 1], ahead.pose[:, 2]
-    nose_x, nose_y = disks.nose_m * np.cos(heading), disks.nose_m * np.sin(heading)
-    return (x + nose_x, y + nose_y), (x - nose_x, y - nose_y)
-
-
 def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
     """(K,) m: how much nearer than the clearance each plan comes to vehicles that brake for it, at most CAR_DEEP_M.
 
@@ -338,7 +292,7 @@ def car_nearness(known: Privileged, disks: BodyDisks, ahead: Ahead) -> Floats:
     if not len(xy):
         return np.zeros(ahead.s_m.shape[1])
     speed = np.maximum(np.hypot(velocity[:, 0], velocity[:, 1]), 1e-9)
-    braked_s = np.minimum(_TIMES_S[:, None], speed / CAR_BRAKE_MPS2)
+    braked_s = np.minimum(STEP_TIMES_S[:, None], speed / CAR_BRAKE_MPS2)
     driven_m = speed * braked_s - 0.5 * CAR_BRAKE_MPS2 * braked_s**2
     cars = xy + driven_m[..., None] * (velocity / speed[:, None])
     gaps = np.full(ahead.s_m.shape, np.inf)

@@ -17,6 +17,7 @@ from cosim.episode.driver import Driver
 from cosim.episode.ports import Observation, Privileged
 from cosim.policies.body import BodyDisks
 from cosim.policies.clearance import Clearance
+from cosim.policies.encounters import Yielding, gaps_to_people
 from cosim.policies.foresight import STEP_S, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
 from cosim.policies.orca import STOP_BEFORE_M, Here, Orca, car_nearness, lane_past, stop_limit
@@ -109,6 +110,32 @@ def test_a_car_that_brakes_counts_where_it_comes_to_rest_and_never_more_than_hal
         cars = Vehicles.of(("v0",), [(7.0, far_m)], [-math.pi / 2], [6.0], [(4.4, 1.8)])
         scene = dataclasses.replace(known(people()), vehicles=cars, crossings=(("c", 4.0, 12.0),))
         assert car_nearness(scene, BodyDisks.of(COURIER), ahead)[0] == pytest.approx(nearness)
+
+
+def test_it_stands_for_who_comes_straight_at_it_until_they_are_past() -> None:
+    """From 4.5 m, while they go round it, no longer than seven seconds; not for who comes past it or is far."""
+    at_it, round_it, past_it = (
+        people((x_m, y_m, heading, 1.4, "walk"))
+        for x_m, y_m, heading in ((9.0, 0.0, math.pi), (6.5, 0.6, 2.4), (3.5, 1.0, 2.9))
+    )
+    yielding = Yielding()
+    assert not yielding.waits(known(round_it), 0.0)
+    assert [yielding.waits(known(one), 1.0) for one in (at_it, round_it, past_it)] == [True, True, False]
+    assert yielding.waits(known(round_it), 7.9) and not yielding.waits(known(at_it), 8.1)
+    for x_m, heading in ((9.0, math.pi - 0.3), (9.0, 0.0), (10.0, math.pi)):
+        assert not Yielding().waits(known(people((x_m, 0.0, heading, 1.4, "walk"))), 1.0)
+
+
+def test_who_is_near_may_stay_and_who_waits_does_not_turn() -> None:
+    """Somebody 1.1 m ahead who is about to leave sideways counts where it is, too; 4 m off it does not."""
+    plans = Plans(np.array([0.0, 1.5]), np.array([1.4, 0.0]), np.full(2, 0.9), np.zeros(2))
+    ahead = foresee(Way(ROUTE), plans, COURIER, Pose(5.0, 0.0, 0.0), 5.0, (1.4, 0.0))
+    assert np.ptp(ahead.pose[:, 2, 1]) == 0.0
+    gaps = [
+        gaps_to_people(known(crowd := people((x_m, 0.3, 1.57, 2.0, "walk"))), COURIER, ahead, crowd, lines(people()))[0]
+        for x_m in (6.1, 9.0)
+    ]
+    assert gaps[0] < 0.0 < 0.3 < gaps[1]
 
 
 @pytest.mark.engine
