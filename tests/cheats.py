@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache
+
+import numpy as np
 
 from cosim.core.state import STILL, Command
 from cosim.episode.ports import CameraSpec, Manifest, Observation
@@ -20,7 +23,7 @@ class Crawl:
     """Drives straight ahead at one speed."""
 
     def __init__(self, v_mps: float = 0.4) -> None:
-        self.manifest = Manifest(f"crawl-{v_mps:g}", rate_hz=10.0)
+        self.manifest = Manifest(f"crawl-{v_mps:g}", rate_hz=10.0, camera=None)
         self._command = Command(v_mps, 0.0)
 
     def reset(self, episode_id: str, seed: int) -> None:
@@ -35,7 +38,7 @@ class Stander(Crawl):
 
     def __init__(self, v_mps: float = 1.0, after_s: float = 2.0) -> None:
         super().__init__(v_mps)
-        self.manifest = Manifest(f"stander-{after_s:g}", rate_hz=10.0)
+        self.manifest = Manifest(f"stander-{after_s:g}", rate_hz=10.0, camera=None)
         self._after_s = after_s
 
     def act(self, observation: Observation) -> Command:
@@ -47,7 +50,7 @@ class StopAndGo(Crawl):
 
     def __init__(self, v_mps: float = 1.2, goes_s: float = 1.2, stands_s: float = 1.2) -> None:
         super().__init__(v_mps)
-        self.manifest = Manifest(f"stop-and-go-{v_mps:g}", rate_hz=10.0)
+        self.manifest = Manifest(f"stop-and-go-{v_mps:g}", rate_hz=10.0, camera=None)
         self._goes_s, self._period_s = goes_s, goes_s + stands_s
 
     def act(self, observation: Observation) -> Command:
@@ -64,7 +67,7 @@ class EdgeDriver(Crawl):
 
     def __init__(self, v_mps: float = 1.0, side: int = 1) -> None:
         super().__init__(v_mps)
-        self.manifest = Manifest(f"edge-{v_mps:g}", rate_hz=10.0)
+        self.manifest = Manifest(f"edge-{v_mps:g}", rate_hz=10.0, camera=None)
         self._w_radps = side * self.TURN_RADPS
         self._turns = round(10.0 * (self.ASIDE_M / (v_mps * self.TURN_RADPS)) ** 0.5)
 
@@ -73,6 +76,76 @@ class EdgeDriver(Crawl):
         turns = (answers < self._turns) - (self._turns <= answers < 2 * self._turns + 2)
         return Command(self._command.v_mps, turns * self._w_radps)
 
+
+class Spinner(Crawl):
+    """Turns on the spot as fast as it can, and so looks at nobody for long."""
+
+    def __init__(self) -> None:
+        super().__init__(0.0)
+        self.manifest = Manifest("spinner", rate_hz=10.0, camera=None)
+        self._command = Command(0.0, 0.65)
+
+
+class WallHugger(EdgeDriver):
+    """Drives along the left edge of the sidewalk."""
+
+    def __init__(self) -> None:
+        super().__init__(0.8)
+        self.manifest = Manifest("wall-hugger", rate_hz=10.0, camera=None)
+
+
+class EarlyLeaver(Crawl):
+    """Looks at what the simulator knows, and wherever people come near leaves the sidewalk rather than meet them."""
+
+    def __init__(self) -> None:
+        super().__init__(1.0)
+        self.manifest = Manifest("early-leaver", rate_hz=10.0, camera=None, privileged=True)
+
+    def act(self, observation: Observation) -> Command:
+        return Command(2.0, 0.65) if _person_within(observation, 14.0) else self._command
+
+
+class Quitter(EarlyLeaver):
+    """The same, and ends its process before it would fail."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.manifest = Manifest("quitter", rate_hz=10.0, camera=None, privileged=True)
+
+    def act(self, observation: Observation) -> Command:
+        if _person_within(observation, 1.0):
+            os._exit(0)
+        return self._command
+
+
+def _person_within(observation: Observation, far_m: float) -> bool:
+    known = observation.privileged
+    assert known is not None
+    return len(known.people) > 0 and float(np.hypot(*(known.people.xy - known.robot.pose.xy).T).min()) < far_m
+
+
+def _crawls_at(v_mps: float) -> type[Crawl]:
+    """A crawl that can be made by its name alone, as by `cosim run --policy tests.cheats:Crawl04`."""
+
+    class CrawlHere(Crawl):
+        def __init__(self) -> None:
+            super().__init__(v_mps)
+
+    return CrawlHere
+
+
+Crawl03, Crawl04, Crawl08, Crawl12, Crawl15, Crawl20, Crawl25 = map(_crawls_at, BLIND_MPS)
+
+CHEATS: Mapping[str, Callable[[], Crawl]] = {
+    **{f"Crawl{10 * v_mps:02.0f}": _crawls_at(v_mps) for v_mps in BLIND_MPS},
+    "Stander": Stander,
+    "StopAndGo": StopAndGo,
+    "Spinner": Spinner,
+    "WallHugger": WallHugger,
+    "EarlyLeaver": EarlyLeaver,
+    "Quitter": Quitter,
+}
+"""By the names that `tests.cheats` has them."""
 
 _SHORT_M = 2.0
 """So far before an event's people the name reader stands."""

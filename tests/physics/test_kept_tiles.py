@@ -126,7 +126,10 @@ def test_a_name_tells_all_that_a_tile_stands_on() -> None:
     names |= {a.name for tree in trees for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
     rooms = {".".join(room.relative_to(ROOT).parts) for room in kept_tiles._ROOMS}
     ours = {name for name in names if name.startswith(("cosim.", "physics."))}
-    assert {name for name in ours if not {name, name.rpartition(".")[0]} & rooms} <= {"cosim.spec.scenario"}
+    assert {name for name in ours if not {name, name.rpartition(".")[0]} & rooms} <= {
+        "cosim.spec.scenario",
+        "cosim.spec.obstacle",
+    }
     tops = {name.partition(".")[0] for name in names - ours} & packages_distributions().keys() - {"cosim", "physics"}
     packages = {package for top in tops for package in packages_distributions()[top]}
     assert packages - {"msgspec"} <= set(baked._MADE_WITH)

@@ -1,0 +1,54 @@
+"""Policies made to game the rules, on shipped scenarios."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+import cosim
+from scenarios.catalog import load_suite
+from scenarios.events import EVENT_KINDS
+from tests import cheats
+from tests.conftest import Cosim
+
+KINDS = tuple(EVENT_KINDS)
+NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
+
+
+def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
+    """The first shipped ones of these events."""
+    shipped = [s for s in load_suite("reactive").scenarios if s.events]
+    return [s.id for kind in kinds for s in [s for s in shipped if s.events[0].kind == kind][:each]]
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", NAMES)
+def test_a_cheat_solves_no_event(name: str, request: pytest.FixtureRequest) -> None:
+    """On two kinds of event each, on all of them with --whole: no success, and none is left out of the table."""
+    whole, number = request.config.getoption("--whole"), NAMES.index(name)
+    kinds = KINDS if whole else (KINDS[number % 8], KINDS[(number + 3) % 8])
+    table = cosim.run("reactive", getattr(cheats, name)(), scenarios=scenarios_of(kinds, 3 if whole else 1))
+    assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0
+
+
+@pytest.mark.engine
+def test_who_ends_its_process_before_it_fails_has_failed(tmp_path: Path, cosim: Cosim) -> None:
+    """It is counted at its worst in every column, and its run has no rates and ends with 1."""
+    (scenario,) = scenarios_of(("frontal",), 1)
+    words = (
+        "run",
+        "reactive",
+        "--scenario",
+        scenario,
+        "--policy",
+        "tests.cheats:Quitter",
+        "--out",
+        str(tmp_path / "r"),
+    )
+    ran = cosim(*words, cwd=Path(__file__).parents[2])
+    table = pd.read_csv(tmp_path / "r" / "results.csv")
+    assert ran.returncode == 1 and table["status"].tolist() == ["crashed"], ran.stderr
+    assert table[["success", "pedestrian_collision", "left_lane"]].iloc[0].tolist() == [0.0, 1.0, 1.0]
+    assert "none, because 1 crashed" in ran.stdout
