@@ -43,6 +43,7 @@ _REAL_ROUTES: Final = {
 }
 ALL_ROUTES_M: Final = 36_500.0
 _SHORTEST_M: Final = 120.0
+_DIGITS: Final = 4
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,17 @@ def candidate(slot: Slot, seed: int) -> Scenario:
     rng = np.random.default_rng([seed, zlib.crc32(slot.name.encode())])
     # Another turn for each structure, so that those of one city are not all of one hour.
     light = drawn_daylight(rng, slot.number + 5 * zlib.crc32(slot.structure.encode()) % 84)
-    return msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
+    whole = msgspec.structs.replace(drawn, light=light, split=slot.split, structure=slot.structure)
+    return msgspec.convert(_in_few_digits(msgspec.to_builtins(whole)), Scenario)
+
+
+def _in_few_digits(value: Any) -> Any:
+    """A spec as plain data, its numbers in as many digits as anybody can measure: a suite's file is half as large."""
+    if isinstance(value, float):
+        return round(value, _DIGITS)
+    if isinstance(value, dict):
+        return {key: _in_few_digits(item) for key, item in value.items()}
+    return [_in_few_digits(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def repeated(slot: Slot, of: Scenario) -> Scenario:
