@@ -113,7 +113,7 @@ def ways_left(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
 
 
 def narrow_places(scenario: Scenario, street_map: StreetMap) -> Iterator[str]:
-    """Where obstacles leave less than the robot's width and half a metre. Where none stand the way is as wide as it is."""
+    """Where obstacles leave less than the robot's width and half a metre; where none stand nothing is claimed."""
     if not scenario.obstacles:
         return
     try:
