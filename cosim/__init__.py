@@ -28,7 +28,10 @@ if TYPE_CHECKING:
     from cosim.episode.ports import BatchPolicy, CameraSpec, Manifest, Observation, Policy, WaypointRule
     from cosim.policies.load import load_policy
     from cosim.records.record import Record
+    from cosim.spec.goal import ImageGoal, Instruction, PointGoal, RoutePatch
+    from cosim.spec.odometry import Odometry
     from cosim.spec.options import EpisodeOptions
+    from cosim.spec.picture import Calibration, CameraPicture
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.catalog import load_suite
@@ -37,18 +40,25 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BatchPolicy",
+    "Calibration",
+    "CameraPicture",
     "CameraSpec",
     "Command",
     "CosimError",
     "Episode",
     "EpisodeOptions",
+    "ImageGoal",
+    "Instruction",
     "Log",
     "Manifest",
     "Mount",
     "Observation",
+    "Odometry",
+    "PointGoal",
     "Policy",
     "Record",
     "Robot",
+    "RoutePatch",
     "Scenario",
     "Suite",
     "WaypointRule",
@@ -59,18 +69,25 @@ __all__ = [
 
 _HOMES = {
     "BatchPolicy": "cosim.episode.ports",
+    "Calibration": "cosim.spec.picture",
+    "CameraPicture": "cosim.spec.picture",
     "CameraSpec": "cosim.episode.ports",
     "Command": "cosim.core.state",
     "CosimError": "cosim.core.errors",
     "Episode": "scenarios.execution.episode",
     "EpisodeOptions": "cosim.spec.options",
+    "ImageGoal": "cosim.spec.goal",
+    "Instruction": "cosim.spec.goal",
     "Log": "cosim.episode.log",
     "Manifest": "cosim.episode.ports",
     "Mount": "cosim.spec.robot",
     "Observation": "cosim.episode.ports",
+    "Odometry": "cosim.spec.odometry",
+    "PointGoal": "cosim.spec.goal",
     "Policy": "cosim.episode.ports",
     "Record": "cosim.records.record",
     "Robot": "cosim.spec.robot",
+    "RoutePatch": "cosim.spec.goal",
     "Scenario": "cosim.spec.scenario",
     "Suite": "cosim.spec.scenario",
     "WaypointRule": "cosim.episode.ports",

@@ -42,6 +42,7 @@ SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
 OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
+GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 
 
@@ -101,6 +102,7 @@ def run_command(
     groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
+    goal: Annotated[str, typer.Option(help=GOAL_HELP)] = "",
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
     own_camera: Annotated[bool, typer.Option("--own-camera", help=OWN_CAMERA_HELP)] = False,
@@ -129,6 +131,7 @@ def run_command(
     from cosim.cli.tables import kinds_of, print_by_kind, print_table
     from cosim.policies.load import load_policy
     from cosim.records.run_folder import RunFolder
+    from cosim.spec.goal import goal_called
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
     from cosim.spec.robot import COURIER, robot_called
@@ -182,6 +185,7 @@ def run_command(
         seed=run_seed,
         robot=robot,
         own_camera=own_camera,
+        goal=goal_called(goal) if goal else None,
         suite_hash=whole.content_hash,
         camera=drawn_by,
         frames_every_s=frames,
@@ -248,27 +252,12 @@ def run_command(
 def list_all(
     suite: Annotated[str | None, typer.Argument(help="Show the scenarios of this suite.")] = None,
 ) -> None:
-    """List the suites, robots and policies, or the scenarios of a suite."""
-    from cosim.cli.tables import print_scenarios
-    from cosim.policies import POLICIES
-    from cosim.spec.robot import ROBOTS
-    from scenarios.catalog import SUITES, load_suite
+    """List the suites, robots, policies and goals, or the scenarios of a suite."""
+    from cosim.cli.tables import print_names, print_scenarios
+    from scenarios.catalog import load_suite
 
     if suite is None:
-        for name in SUITES:
-            whole = load_suite(name)
-            out.print(
-                f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}"
-            )
-        for one in ROBOTS.values():
-            size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
-            out.print(
-                f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at {one.w_max_radps:g} rad/s"
-            )
-            for name, mount in one.mounts.items():
-                out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
-        for name, make in POLICIES.items():
-            out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+        print_names(out)
         return
     print_scenarios(out, load_suite(suite))
 

@@ -116,14 +116,37 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
 
 
 def print_terms(out: Console, table: pd.DataFrame) -> None:
-    """What the policy saw by, how its waypoints were followed, the run's seed; and what is not as the robot has it."""
-    named = ["camera", "rate_hz", "waypoints", "run_seed", "nonstandard"]
+    """What the policy saw by and was told of where to go, how its waypoints were followed, the run's seed; and what is
+    not as the robot has it."""
+    named = ["camera", "rate_hz", "goal_protocol", "odometry", "waypoints", "run_seed", "nonstandard"]
     if not {*named} <= set(table.columns):
         return
-    for camera, rate_hz, waypoints, seed, odd in table[named].drop_duplicates().itertuples(index=False):
-        out.print(f"camera {camera}, at {rate_hz:g} Hz; {waypoints}; seed {seed}", highlight=False, markup=False)
+    for camera, rate_hz, goal, odometry, waypoints, seed, odd in table[named].drop_duplicates().itertuples(index=False):
+        told = f"camera {camera}, at {rate_hz:g} Hz; goal {goal}; odometry {odometry}; {waypoints}; seed {seed}"
+        out.print(told, highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
+
+
+def print_names(out: Console) -> None:
+    """Suites, robots and their cameras, policies, goals: a line for each."""
+    from cosim.policies import POLICIES
+    from cosim.spec.goal import GOALS
+    from cosim.spec.robot import ROBOTS
+    from scenarios.catalog import SUITES, load_suite
+
+    for name in SUITES:
+        whole = load_suite(name)
+        out.print(f"suite   {name}  {len(whole.scenarios)} scenarios, version {whole.version}, {whole.content_hash}")
+    for one in ROBOTS.values():
+        size = f"{one.length_m:.2f} x {one.width_m:.2f} m"
+        out.print(f"robot   {one.name}  {size}, travels at {one.cruise_mps:g} m/s, turns at {one.w_max_radps:g} rad/s")
+        for name, mount in one.mounts.items():
+            out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
+    for name, make in POLICIES.items():
+        out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+    for name, words in GOALS.items():
+        out.print(f"goal    {name}  {words}", soft_wrap=True)
 
 
 def print_scenarios(out: Console, suite: Suite) -> None:

@@ -13,7 +13,9 @@ import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Literal, Protocol, cast
+from typing import Any, Literal, Protocol, cast
+
+from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
@@ -21,6 +23,7 @@ from cosim.core.geometry import Polyline
 from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.ports import BatchPolicy, Manifest, Observation, Policy, Privileged
+from cosim.spec.goal import own_goal
 
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
@@ -136,10 +139,17 @@ class Driver:
 
     def _own(self, observation: Observation) -> Observation:
         """What the policy may know, as copies of its own."""
-        rgb, known = observation.rgb, observation.privileged
+        known, pictures = observation.privileged, observation.pictures
         return replace(
             observation,
-            rgb=None if rgb is None else rgb.copy(),
+            rgb=_copied(observation.rgb),
+            depth=_copied(observation.depth),
+            labels=_copied(observation.labels),
+            pictures={
+                name: replace(one, rgb=one.rgb.copy(), depth=_copied(one.depth), labels=_copied(one.labels))
+                for name, one in pictures.items()
+            },
+            goal=own_goal(observation.goal),
             privileged=self._own_knowledge(known) if known is not None and self.manifest.privileged else None,
         )
 
@@ -166,7 +176,7 @@ class BatchDriver:
     crash; whatever the policy raises is the crash of all that it was asked for."""
 
     def __init__(self, driver: Driver) -> None:
-        self._driver = driver
+        self._driver, self.manifest = driver, driver.manifest
         self._policy = cast(BatchPolicy, driver._policy)
         self._answered: set[str] = set()
 
@@ -221,6 +231,10 @@ class BatchDriver:
     def _crash(self, told: str, doing: PolicyCall, seen: Observation, among: int) -> PolicyError:
         together = f", asked for {among} episodes together" if among > 1 else ""
         return PolicyError(f"policy '{self._driver.manifest.name}' {told} ({when(doing, seen.tick)}{together})")
+
+
+def _copied(picture: NDArray[Any] | None) -> NDArray[Any] | None:
+    return None if picture is None else picture.copy()
 
 
 def _as_many(answers: Sequence[object], count: int) -> list[object]:

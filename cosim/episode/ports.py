@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from dataclasses import field as filled
 from typing import Literal, Protocol, get_args
 
 import numpy as np
@@ -15,6 +16,9 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import Command, Frame, Motion, People, RobotState, Signal, Street, Vehicles
 from cosim.spec.events import EventQuery, EventReply
+from cosim.spec.goal import Goal, GoalProtocol
+from cosim.spec.odometry import Odometry, OdometryKind
+from cosim.spec.picture import Calibration, CameraPicture
 from cosim.spec.robot import Mount, Robot
 
 
@@ -58,7 +62,8 @@ class CameraSpec:
     mount: the name of one of the robot's mounts, which every robot has elsewhere and whose limits hold for size, field
     of view and rate. A place of one's own, or what is beyond the limits, needs `EpisodeOptions.own_camera`.
     crop: (x0, y0, x1, y1) in pixels of the whole picture: the policy gets its columns x0 to x1 and rows y0 to y1 alone,
-    from the upper left corner, without x1 and y1. Raises SpecError where that is no part of the picture.
+    from the upper left corner, without x1 and y1. depth, labels: whether the policy gets these of each picture, too.
+    Raises SpecError where the crop is no part of the picture.
 
     >>> CameraSpec(width=512, height=288, fov_deg=60.0, crop=(0, 88, 512, 288)).size
     (512, 200)
@@ -70,6 +75,8 @@ class CameraSpec:
     mount: str | Mount = "front"
     lens: Lens = Lens()
     crop: tuple[int, int, int, int] | None = None
+    depth: bool = False
+    labels: bool = False
 
     def __post_init__(self) -> None:
         if self.crop is None:
@@ -93,8 +100,8 @@ class CameraSpec:
         """As tables tell it."""
         own = "own mount" if isinstance(self.mount, Mount) else self.mount
         crop = "" if self.crop is None else ", crop " + " ".join(map(str, self.crop))
-        lens = "" if self.lens == Lens() else ", lens"
-        return f"{own}, {self.width} x {self.height} px, {self.fov_deg:g} deg{crop}{lens}"
+        more = ", lens" * (self.lens != Lens()) + ", depth" * self.depth + ", labels" * self.labels
+        return f"{own}, {self.width} x {self.height} px, {self.fov_deg:g} deg{crop}{more}"
 
     def on(self, robot: Robot) -> Mount:
         """Where it sits on a robot. Raises UsageError, listing the robot's mounts, if it has none of that name."""
@@ -122,7 +129,11 @@ class Privileged:
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds.
+    """What a policy gets. rgb: (H, W, 3) uint8 or None without a camera; v_mps, w_radps: its own speeds, without error.
+
+    Where the manifest asks for them: depth (H, W) float32, metres along the camera's axis; labels (H, W) uint8 of
+    `cosim.core.state.LABELS`; camera: how `rgb` was taken; pictures: of the further cameras, by name; odometry: where
+    the robot takes itself to be; goal: by the protocol of the manifest or of the run (`cosim.spec.goal`).
 
     tick, time_s: since the start of the episode; robot: which one it drives, the same from reset to the end: its size,
     its pace, its limits; privileged: only for a manifest that declares it; episode: of which one it is, as `reset` was
@@ -144,6 +155,12 @@ class Observation:
     privileged: Privileged | None = None
     episode: str = ""
     reset: bool = False
+    goal: Goal | None = None
+    odometry: Odometry | None = None
+    camera: Calibration | None = None
+    depth: NDArray[np.float32] | None = None
+    labels: NDArray[np.uint8] | None = None
+    pictures: Mapping[str, CameraPicture] = filled(default_factory=dict)
 
 
 HowFollowed = Literal["shipped", "atan2"]
@@ -187,8 +204,10 @@ class WaypointRule:
 class Manifest:
     """What a policy says of itself. rate_hz: how often it acts; waypoints: how those that it answers are followed.
 
-    camera: what it sees by, None for a blind one; privileged: whether it is told what a camera does not show. Raises
-    nothing itself: an episode refuses what cannot be, such as a rate of which a period is no whole number of ticks.
+    camera: what it sees by, None for a blind one; cameras: further ones, by names of its own; goal: what it is told of
+    where to go (`cosim.spec.goal.GOALS`), unless the run says otherwise; odometry: what its sensors tell of where it is
+    (`cosim.spec.odometry.ODOMETRY`); privileged: whether it is told what a camera does not show. Raises nothing itself:
+    an episode refuses what cannot be, such as a rate of which a period is no whole number of ticks.
 
     >>> Manifest("mine", rate_hz=5.0, camera=CameraSpec(width=512, height=288)).camera.height
     288
@@ -200,6 +219,9 @@ class Manifest:
     camera: CameraSpec | None = CameraSpec()
     privileged: bool = False
     waypoints: WaypointRule = WaypointRule()
+    goal: GoalProtocol = "none"
+    odometry: OdometryKind = "none"
+    cameras: Mapping[str, CameraSpec] = filled(default_factory=dict)
 
 
 class Policy(Protocol):

@@ -109,7 +109,8 @@ def _wrong(manifest: Manifest) -> str:
     for field, text in (("name", manifest.name), ("version", manifest.version)):
         if not 0 < len(text) <= LONGEST_NAME or not text.isprintable() or "/" in text or text.startswith("."):
             return f"{field} must be a text of 1 to {LONGEST_NAME} printable characters, without '/', not {text!r:.80}"
-    return "" if manifest.camera is None else _wrong_camera(manifest.camera)
+    cameras = [*([] if manifest.camera is None else [manifest.camera]), *manifest.cameras.values()]
+    return next(filter(None, map(_wrong_camera, cameras)), "")
 
 
 def _wrong_camera(camera: CameraSpec) -> str:

@@ -25,6 +25,7 @@ from cosim.judge.nearness import nearness
 from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
+from cosim.spec.odometry import OdometryKind
 from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
@@ -89,9 +90,12 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     policy_source: str = ""
     waypoints: WaypointRule = WaypointRule()
     camera: CameraSpec | None = None
+    cameras: dict[str, CameraSpec] = {}
     rate_hz: float = 4.0
     nonstandard: str = ""
     goal_protocol: str
+    odometry: OdometryKind = "none"
+    privileged: bool = False
     renderer: str
     versions: dict[str, str]
     status: Status
@@ -156,9 +160,12 @@ def begun(
         policy_source=policy_source,
         waypoints=manifest.waypoints,
         camera=manifest.camera,
+        cameras=dict(manifest.cameras),
         rate_hz=manifest.rate_hz,
         nonstandard=nonstandard(manifest, robot_called(scenario.robot)),
-        goal_protocol="route" if manifest.privileged else "none",
+        goal_protocol=manifest.goal,
+        odometry=manifest.odometry,
+        privileged=manifest.privileged,
         renderer=NO_RENDERER,
         versions=versions(),
         status="crashed",

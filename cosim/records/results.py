@@ -17,7 +17,7 @@ from cosim.records.record import Record
 KEYS: tuple[str, ...] = (
     "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "split",
     "structure", "crowd_added", "run_seed", "episode", "robot", "policy", "policy_version", "camera", "rate_hz",
-    "waypoints", "nonstandard", "goal_protocol", "renderer", "ticks", "state_hash",
+    "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
@@ -36,7 +36,8 @@ def table_row(record: Record) -> dict[str, Any]:
     """One flat row. A function of scenario, policy and versions alone: wall times are left out."""
     row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
     row["waypoints"] = record.waypoints.in_words
-    row["camera"] = "none" if record.camera is None else record.camera.in_words
+    further = [f"{name}: {spec.in_words}" for name, spec in record.cameras.items()]
+    row["camera"] = "none" if record.camera is None else "; ".join([record.camera.in_words, *further])
     row["metric_schema"] = metrics.SCHEMA
     row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {"done": record.measures, "crashed": WORST, "invalid": {}}

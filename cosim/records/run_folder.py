@@ -30,6 +30,8 @@ from cosim.core.whole_file import write_whole
 from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
+from cosim.spec.goal import GoalProtocol
+from cosim.spec.odometry import OdometryKind
 from cosim.spec.scenario import Suite, write_suite
 
 DATABASE = "results.sqlite"
@@ -43,7 +45,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
     "versions", "renderer", "counterfactual", "waypoints", "seed",
-    "camera", "rate_hz",
+    "camera", "cameras", "rate_hz", "goal_protocol", "odometry",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -65,7 +67,10 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_source: str = ""
     waypoints: WaypointRule = WaypointRule()
     camera: CameraSpec | None = None
+    cameras: dict[str, CameraSpec] = {}
     rate_hz: float = 4.0
+    goal_protocol: GoalProtocol = "none"
+    odometry: OdometryKind = "none"
     seed: int = 0
     scenarios: tuple[str, ...]
     versions: dict[str, str]

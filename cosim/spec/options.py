@@ -6,6 +6,7 @@ from typing import Literal
 
 import msgspec
 
+from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
 from cosim.spec.pseudonym import check_seed
 
@@ -35,10 +36,11 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
     (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
-    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. suite_hash, policy_source: of the suite
-    that the scenario is of and of the file of the policy, for the record. own_camera: the policy may see by a camera
-    that the robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what
-    draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it is on the air
+    0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. goal: what the policy is told of where
+    to go (`cosim.spec.goal`), in place of what its manifest says. suite_hash, policy_source: of the suite that the
+    scenario is of and of the file of the policy, for the record. own_camera: the policy may see by a camera that the
+    robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what draws
+    pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it is on the air
     meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual: compare it with
     its street without the robot. injections: pedestrians that were injected into the episode that this one replays.
     renderer: what draws for the policy in place of a camera of its own.
@@ -49,6 +51,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
 
     seed: int | None = None
     robot: str = ""
+    goal: GoalProtocol | None = None
     suite_hash: str = ""
     policy_source: str = ""
     own_camera: bool = False

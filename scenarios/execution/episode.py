@@ -26,6 +26,7 @@ from cosim.core.errors import PolicyError, UsageError
 from cosim.core.state import STILL, Frame
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.control import command_of
+from cosim.episode.given import with_goal
 from cosim.episode.log import Log
 from cosim.episode.loop import Moment, after, begin, tick
 from cosim.episode.ports import CameraSpec, Eyes, Manifest, Observation
@@ -84,6 +85,7 @@ class Episode:
         kinds: EventKinds = EVENT_KINDS,
     ) -> None:
         self.scenario = scenario = scenario.driven_by(options.robot)
+        manifest = with_goal(manifest, options.goal)
         self.manifest, self.options = manifest, options
         check_camera(manifest, robot_called(scenario.robot), options.own_camera)
         run_seed = 0 if options.seed is None else options.seed
@@ -189,6 +191,7 @@ class Episode:
                 watch(step, verdict)
             self._now = now = after(step, verdict.reset, stage.parts)
             self._was_reset |= verdict.reset is not None
+            stage.observer.moved(step, verdict.reset is not None)
             if self.over or self.clock.acts(now.tick) or now.tick == until_tick:
                 return self._observe(stage, now)
             frame, command = None, command if verdict.reset is None else STILL
@@ -204,15 +207,12 @@ class Episode:
         return self._result
 
     def _observe(self, stage: StagedScenario, now: Moment) -> Observation:
-        """What the policy is given now; what the simulator knows only to a policy whose manifest asks for it."""
-        parts = stage.parts
-        self._frame = parts.camera.render(now.robot, now.street) if parts.camera is not None else None
-        known = stage.known(now) if self.manifest.privileged else None
-        rgb = self._frame.rgb if self._frame is not None else None
-        v_mps, w_radps, time_s = now.robot.v_mps, now.robot.w_radps, self.clock.time_s(now.tick)
+        """What the policy is given now."""
         was_reset = self._was_reset
         self._was_reset = was_reset and not self.clock.acts(now.tick)
-        return Observation(now.tick, time_s, rgb, v_mps, w_radps, stage.robot, known, self.id, was_reset)
+        time_s, camera = self.clock.time_s(now.tick), stage.parts.camera
+        seen, self._frame = stage.observer.observed(now, time_s, camera, was_reset)
+        return seen
 
     @property
     def _open(self) -> StagedScenario:

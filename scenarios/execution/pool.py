@@ -19,6 +19,7 @@ from typing import NamedTuple
 import msgspec
 
 from cosim.core.errors import MachineError, RunError, UsageError
+from cosim.episode.given import with_goal
 from cosim.records.record import Record, Status, begun
 from cosim.records.run_folder import RunFolder
 from cosim.spec.options import EpisodeOptions
@@ -232,7 +233,8 @@ class _Pool:
     def give_up(self, scenario: Scenario, reason: str, status: Status = "crashed") -> None:
         """Record a scenario that does not come to its end: no worker survives it, or the policy does not answer."""
         spec = self._folder.spec
-        record = begun(scenario, self._hello.manifest, spec.suite_hash, self._hello.source_hash, spec.seed)
+        manifest = with_goal(self._hello.manifest, self._options.goal)
+        record = begun(scenario, manifest, spec.suite_hash, self._hello.source_hash, spec.seed)
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 

@@ -14,6 +14,7 @@ from cosim.core.errors import UsageError
 from cosim.core.versions import versions
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.driver import Driver
+from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
 from cosim.records.record import NO_RENDERER
@@ -99,8 +100,9 @@ def run_spec(
     whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions, shared: bool = False
 ) -> RunSpec:
     """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it. Raises UsageError when
-    a robot has no such camera, unless one of its own was asked for."""
-    manifest, robots = driver.manifest, [robot_called(name) for name in sorted({one.robot for one in picked})]
+    a robot has no such camera, unless one of its own was asked for, or the policy cannot be given what it asks for."""
+    manifest = with_goal(driver.manifest, options.goal)
+    robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
     if manifest.camera is not None:
         for robot in robots:
             check_camera(manifest, robot, options.own_camera)
@@ -115,7 +117,10 @@ def run_spec(
         policy_source=driver.source_hash,
         waypoints=manifest.waypoints,
         camera=manifest.camera,
+        cameras=dict(manifest.cameras),
         rate_hz=manifest.rate_hz,
+        goal_protocol=manifest.goal,
+        odometry=manifest.odometry,
         seed=0 if options.seed is None else options.seed,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),

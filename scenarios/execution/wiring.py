@@ -10,11 +10,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
+from cosim.core.geometry import Pose
+from cosim.core.state import RobotState, Street
 from cosim.episode.loop import Moment, Parts
+from cosim.episode.observing import Observer
 from cosim.episode.ports import Camera, CameraSpec, Director, Eyes, Manifest, Privileged
 from cosim.people.standing import Standing, standing_bodies
 from cosim.place import overlay
@@ -54,15 +58,15 @@ FRONTAGE_M = 2.0
 
 @dataclass(slots=True)
 class StagedScenario:
-    """A scenario ready to run. parts: its engines; robot: which one drives. renderer: what draws for the policy. known:
-    all that the simulator knows at a moment. eyes: makes further cameras. injected: takes pedestrians in. entrances:
-    who comes and goes in the street."""
+    """A scenario ready to run. parts: its engines; robot: which one drives. renderer: what draws for the policy.
+    observer: makes what it is given. eyes: makes further cameras. injected: takes pedestrians in. entrances: who comes
+    and goes in the street."""
 
     parts: Parts
     robot: Robot
     renderer: str
     scorer: Scorer
-    known: Callable[[Moment], Privileged]
+    observer: Observer
     eyes: Callable[[CameraSpec], AbstractContextManager[Eyes]]
     injected: InjectedPeople
     entrances: Entrances
@@ -91,7 +95,7 @@ def staged(
         stack.enter_context(crowd)
 
         def eyes(spec: CameraSpec) -> AbstractContextManager[Eyes]:
-            return camera_of(camera_of_choice(options.camera), world, spec, light=scenario.light)
+            return camera_of(camera_of_choice(options.camera), world, spec, light=scenario.light, depth=spec.depth)
 
         camera: Camera | None = None
         renderer = NO_RENDERER
@@ -101,6 +105,8 @@ def staged(
                 camera, renderer = shared, shared.renderer
         elif manifest.camera is not None:
             camera, renderer = stack.enter_context(eyes(manifest.camera)), renderer_of(camera_of_choice(options.camera))
+        cameras = {name: stack.enter_context(eyes(spec)) for name, spec in manifest.cameras.items()}
+        look = None if camera is None else partial(empty_street, camera, street, robot)
         director = stack.enter_context(director_of(scenario.id, options.director, waiting, kinds))
         if scenario.crowd.residents:
             from scenarios.residents.director import among_residents  # with what draws their graph
@@ -124,7 +130,9 @@ def staged(
             robot=robot,
             renderer=renderer,
             scorer=Scorer(scenario, kinds, street_map, WalkableArea(walkable), robot, world.hidden, clock),
-            known=lambda now: known(scenario, free(), now),
+            observer=Observer(
+                scenario, manifest, options.seed or 0, lambda now: known(scenario, free(), now), cameras, look
+            ),
             eyes=eyes,
             injected=injected,
             entrances=crowd.entrances,
@@ -168,6 +176,12 @@ def known(scenario: Scenario, free: Polygon | MultiPolygon, now: Moment) -> Priv
     return Privileged(
         now.robot, scenario.route_line, now.route_s_m, street.people, street.vehicles, street.signals, crossings, free
     )
+
+
+def empty_street(camera: Camera, surface: Surface, robot: Robot, pose: Pose) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8: what a robot would see by a camera at a pose, with nobody in the street."""
+    z_m, _, _ = surface.lean(pose, robot.drive.span_m)
+    return camera.render(RobotState(pose, z_m=z_m), Street(0)).rgb
 
 
 def on_map(street_map: StreetMap, x_m: float, y_m: float) -> bool:

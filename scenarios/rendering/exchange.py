@@ -14,6 +14,8 @@ import msgspec
 import numpy as np
 
 from cosim.core.state import People, RobotState, Signal, Street, Vehicles, write_protected
+from cosim.spec.goal import Goal
+from cosim.spec.odometry import Odometry
 from cosim.spec.scenario import Scenario
 from scenarios.execution.messages import Hello
 
@@ -78,6 +80,8 @@ class Ask(msgspec.Struct, frozen=True, tag=True):
     w_radps: float
     known: Knowledge | None
     reset: bool = False
+    goal: Goal | None = None
+    odometry: Odometry | None = None
 
 
 class Fine(msgspec.Struct, frozen=True, tag=True):

@@ -167,7 +167,8 @@ class AskedElsewhere(Driver):
     def act(self, observation: Observation) -> Command:
         known = observation.privileged if self.manifest.privileged else None
         told = None if known is None else self._told(known)
-        request = Ask(observation.tick, observation.v_mps, observation.w_radps, told, observation.reset)
+        seen = observation
+        request = Ask(seen.tick, seen.v_mps, seen.w_radps, told, seen.reset, seen.goal, seen.odometry)
         reply = link_to(self._address).ask(request, when("act", observation.tick))
         assert isinstance(reply, Told)
         return Command(reply.v_mps, reply.w_radps)

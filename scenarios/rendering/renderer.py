@@ -28,6 +28,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.episode.driver import BatchDriver, said_by
+from cosim.episode.given import calibration_of
 from cosim.episode.ports import Observation, Privileged
 from cosim.records.record import NO_RENDERER
 from cosim.spec.robot import robot_called
@@ -282,10 +283,23 @@ class _Renderer:
         """What the policy is given for an environment."""
         ask, scenario = one.wants, one.scenario
         assert isinstance(ask, Ask) and scenario is not None
-        known = None if ask.known is None else _known(ask.known, scenario, one.free)
-        rgb = None if self._atlas is None else one.memory.take().rgb
-        robot, time_s = robot_called(scenario.robot), Clock().time_s(ask.tick)
-        return Observation(ask.tick, time_s, rgb, ask.v_mps, ask.w_radps, robot, known, one.episode, ask.reset)
+        robot, spec = robot_called(scenario.robot), self._driver.manifest.camera if self._driver is not None else None
+        frame = None if self._atlas is None else one.memory.take()
+        return Observation(
+            tick=ask.tick,
+            time_s=Clock().time_s(ask.tick),
+            rgb=None if frame is None else frame.rgb,
+            v_mps=ask.v_mps,
+            w_radps=ask.w_radps,
+            robot=robot,
+            privileged=None if ask.known is None else _known(ask.known, scenario, one.free),
+            episode=one.episode,
+            reset=ask.reset,
+            goal=ask.goal,
+            odometry=ask.odometry,
+            camera=None if spec is None else calibration_of(spec, robot),
+            labels=None if frame is None or spec is None or not spec.labels else frame.labels,
+        )
 
 
 def _known(told: Knowledge, scenario: Scenario, free: Polygon | MultiPolygon) -> Privileged:

@@ -147,6 +147,11 @@ def check_shared(driver: Driver, camera: CameraName) -> bool:
             f"policy '{manifest.name}' has no camera and no method 'act_batch': leave --shared-renderer out, there is "
             "nothing to share"
         )
+    if manifest.cameras or (manifest.camera is not None and manifest.camera.depth):
+        raise UsageError(
+            f"policy '{manifest.name}' asks for {'further cameras' if manifest.cameras else 'depth'}, which a shared "
+            "renderer does not give: leave --shared-renderer out"
+        )
     if manifest.camera is not None and camera != "gl":
         raise UsageError(
             f"--shared-renderer draws by OpenGL, not by the {camera} camera: use --camera gl (`cosim doctor` says "

@@ -318,6 +318,10 @@ def test_names_that_do_not_exist_are_answered_with_those_that_do(desk: Path, cos
         ("run", "tiny.json", "--policy", "nowhere:X"): ("module 'nowhere' cannot be imported", "ModuleNotFoundError"),
         ("run", "tiny.json", "--policy", "mine:Unfinished"): ("'mine:Unfinished' has no attribute 'manifest'", ""),
         ("run", "tiny.json", "--scenario", "t-9"): ("scenario 't-9'", "t-0, t-1, t-2"),
+        ("run", "tiny.json", "--goal", "route"): (
+            "goal protocol 'route'",
+            "random_image, random_point, route_patch",
+        ),
         ("run", "tiny.json", "--resume"): ("--resume needs --out", ""),
         ("show", "whole", "--episode", "t-9"): ("'t-9'", "t-0, t-1, t-2"),
         ("show", "nothing"): ("run 'nothing'", "whole"),

@@ -116,6 +116,9 @@ def test_a_run_folder_stays_where_it_is(tmp_path: Path, monkeypatch: pytest.Monk
         ("seed", 8),
         ("camera", CameraSpec(512, 288)),
         ("rate_hz", 5.0),
+        ("cameras", {"left": CameraSpec(mount="left")}),
+        ("goal_protocol", "route_point"),
+        ("odometry", "gps"),
     ],
 )
 def test_resuming_with_something_else_is_refused(tmp_path: Path, field: str, value: object) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from cosim.core.state import STILL, Command
 from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.spec.goal import ImageGoal
 
 NOTES = "SHARED_NOTES"
 """In the environment: a file that is told who is asked together, and by which process."""
@@ -48,6 +49,19 @@ class Together(Seeing):
         if NOTES in os.environ:
             with Path(os.environ[NOTES]).open("a") as notes:
                 notes.write(f"ended {episode_id}\n")
+
+
+class Guided(Together):
+    """Drives by all that it is given beside its picture: a goal that is one, labels, odometry, the calibration."""
+
+    manifest = Manifest("guided", rate_hz=4.0, camera=CameraSpec(48, 32, labels=True), goal="image", odometry="wheel")
+
+    def act(self, observation: Observation) -> Command:
+        goal, odometry, camera = observation.goal, observation.odometry, observation.camera
+        assert isinstance(goal, ImageGoal) and goal.rgb.shape == (32, 48, 3) and observation.labels is not None
+        assert odometry is not None and odometry.heading_rad is not None and camera is not None
+        turn = float(goal.rgb.mean()) / 1000.0 + float(observation.labels.mean()) / 100.0 + odometry.heading_rad
+        return Command(0.6 + odometry.x_m / 10.0, turn + float(camera.matrix[0, 2]) / 1000.0)
 
 
 class Spy:

@@ -21,7 +21,7 @@ from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
 from cosim.episode.driver import Driver
-from cosim.episode.ports import Policy
+from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies.load import load_policy
 from cosim.records.run_folder import read_records, read_spec
 from cosim.spec.options import EpisodeOptions
@@ -311,6 +311,18 @@ def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
 
 
 @pytest.mark.engine
+def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path) -> None:
+    """Goals that are pictures, labels, odometry and calibration: it drives by them to the same state hash as where it
+    has a camera of its own."""
+    guided, one = f"{OF}:Guided", EpisodeOptions(seed=7)
+    suite_run.run(suite_of("a"), guided, out=tmp_path / "own", options=one)
+    suite_run.run(suite_of("a"), guided, shared_renderer=True, out=tmp_path / "shared", options=one)
+    (own,), (shared,) = read_records(tmp_path / "own"), read_records(tmp_path / "shared")
+    assert (own.status, own.goal_protocol, own.odometry) == ("done", "image", "wheel")
+    assert own.state_hash == shared.state_hash and shared.status == "done"
+
+
+@pytest.mark.engine
 def test_episodes_whose_renderer_is_killed_are_run_again(
     by_themselves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -352,6 +364,11 @@ def test_where_there_is_nothing_to_share_it_is_said() -> None:
         check_shared(load_policy("orca"), "bullet")
     with pytest.raises(UsageError, match="draws by OpenGL, not by the bullet camera: use --camera gl"):
         check_shared(Driver(Seeing()), "bullet")
+    deep = Manifest("deep", camera=CameraSpec(depth=True))
+    wide = Manifest("wide", cameras={"left": CameraSpec(mount="left")})
+    for manifest, what in ((deep, "'deep' asks for depth"), (wide, "'wide' asks for further cameras")):
+        with pytest.raises(UsageError, match=f"policy {what}, which a shared renderer does not give"):
+            check_shared(Driver(Seeing(), manifest), "gl")
     with pytest.raises(UsageError, match="shared_renderer=True needs a policy by its name"):
         suite_run.run(suite_of("a"), Together(), shared_renderer=True)
 

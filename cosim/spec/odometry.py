@@ -1,0 +1,54 @@
+"""Odometry: what a robot's sensors say of where it has gone, and how wrong they are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final, Literal, NamedTuple
+
+import msgspec
+
+OdometryKind = Literal["none", "exact", "wheel", "gps"]
+
+ODOMETRY: Final[Mapping[str, str]] = MappingProxyType(
+    {
+        "none": "nothing",
+        "exact": "where the robot is, without an error",
+        "wheel": "what its wheels count, which does not notice that it was put elsewhere",
+        "gps": "a position with noise and a slow bias, without a heading",
+    }
+)
+"""What a policy gets by each kind, all in the frame of the start of the episode."""
+
+
+class Odometry(msgspec.Struct, frozen=True):
+    """Where the robot takes itself to be: metres ahead and to the left of its start, heading counter-clockwise from the
+    start's, None for gps. Nothing in it tells where on the map that is.
+
+    >>> Odometry(12.0, 0.5, heading_rad=0.1).x_m
+    12.0
+    """
+
+    x_m: float
+    y_m: float
+    heading_rad: float | None
+
+
+class WheelNoise(NamedTuple):
+    """Standard deviations. For a whole episode: scale, of the distance; turn_scale, of turns; drift_radpm, of a turn
+    with every metre. For each metre, growing with its square root: along_m, heading_rad."""
+
+    scale: float = 0.02
+    turn_scale: float = 0.03
+    drift_radpm: float = 0.003
+    along_m: float = 0.02
+    heading_rad: float = 0.01
+
+
+class GpsNoise(NamedTuple):
+    """Standard deviations in metres, of x and of y: noise_m of each fix; bias_m of what lasts for about bias_s seconds
+    (a Gauss-Markov process)."""
+
+    noise_m: float = 0.5
+    bias_m: float = 1.5
+    bias_s: float = 60.0

@@ -1,0 +1,90 @@
+"""Odometry: exact to the bit, wheels and fixes as wrong as they are declared."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from cosim.core.geometry import Pose
+from cosim.episode.odometer import Gps, Odometer, WheelOdometer, odometer_for
+from cosim.spec.odometry import GpsNoise, Odometry, WheelNoise
+
+START = Pose(10.0, 20.0, 0.5 * math.pi)
+"""Looking north."""
+
+
+def driven(odometer: Odometer, poses: list[Pose]) -> Odometry | None:
+    for before, after in itertools.pairwise(poses):
+        odometer.moved(before, after)
+    return odometer.read(poses[-1], 0.05 * (len(poses) - 1))
+
+
+def straight(far_m: float, steps: int = 100) -> list[Pose]:
+    return [Pose(10.0, 20.0 + d, 0.5 * math.pi) for d in np.linspace(0.0, far_m, steps + 1).tolist()]
+
+
+def test_exact_odometry_is_where_the_robot_is_from_its_start() -> None:
+    """3 m north and 2 m west of a start that looks north, looking west: 3 m ahead, 2 m left, a quarter turn; carried
+    or driven."""
+    told = odometer_for("exact", START, np.random.default_rng(0)).read(Pose(8.0, 23.0, math.pi), 1.0)
+    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (told.x_m, told.y_m) == pytest.approx((3.0, 2.0))
+    assert odometer_for("none", START, np.random.default_rng(0)).read(START, 1.0) is None
+
+
+def test_wheels_without_errors_count_the_way_and_not_what_carries_the_robot() -> None:
+    """A quarter circle of 5 m to the left; then it is put elsewhere, and drives 2 m on."""
+    counted = WheelOdometer(np.random.default_rng(0), WheelNoise(0.0, 0.0, 0.0, 0.0, 0.0))
+    angles = np.linspace(0.0, 0.5 * math.pi, 200).tolist()
+    told = driven(counted, [Pose(5 * math.sin(a), 5 - 5 * math.cos(a), a) for a in angles])
+    assert told is not None and told.heading_rad == pytest.approx(0.5 * math.pi)
+    assert (told.x_m, told.y_m) == pytest.approx((5.0, 5.0), abs=1e-3)
+    told = driven(counted, straight(2.0))
+    assert told is not None and (told.x_m, told.y_m) == pytest.approx((5.0, 7.0), abs=1e-3)
+
+
+def test_wheels_are_as_wrong_as_declared() -> None:
+    """Over 400 episodes of 100 m: scale and noise make the length, drift and noise the heading; nothing is wrong of a
+    robot that stands."""
+    noise, far_m = WheelNoise(), 100.0
+    ends = [driven(WheelOdometer(np.random.default_rng(seed)), straight(far_m)) for seed in range(400)]
+    headings = np.array([one.heading_rad for one in ends if one is not None], dtype=float)
+    expected = math.hypot(noise.drift_radpm * far_m, noise.heading_rad * math.sqrt(far_m))
+    assert headings.std() == pytest.approx(expected, rel=0.1) and abs(headings.mean()) < 0.2 * expected
+    short = [driven(WheelOdometer(np.random.default_rng(seed)), straight(1.0)) for seed in range(400)]
+    lengths = np.array([math.hypot(one.x_m, one.y_m) for one in short if one is not None])
+    assert lengths.std() == pytest.approx(math.hypot(noise.scale, noise.along_m), rel=0.1)
+    assert driven(WheelOdometer(np.random.default_rng(1)), [START] * 100) == Odometry(0.0, 0.0, 0.0)
+
+
+def test_fixes_are_as_wrong_as_declared() -> None:
+    """Over 400 episodes each fix is off by noise and bias; from one second to the next by the noise alone, nearly; a
+    minute later the bias is another; no heading is told."""
+    noise = GpsNoise()
+    errors = []
+    for seed in range(400):
+        gps = Gps(START, np.random.default_rng(seed))
+        told = [gps.read(Pose(10.0, 23.0, 0.0), time_s) for time_s in (0.0, 1.0, 61.0)]
+        assert {one.heading_rad for one in told} == {None}
+        errors.append([(one.x_m - 3.0, one.y_m) for one in told])
+    off = np.array(errors)
+    assert off.std(axis=0) == pytest.approx(np.full((3, 2), math.hypot(noise.noise_m, noise.bias_m)), rel=0.12)
+    short, long = (off[:, 1] - off[:, 0]).std(), (off[:, 2] - off[:, 1]).std()
+    kept = math.exp(-1.0 / 60.0)
+    assert short == pytest.approx(
+        math.hypot(math.sqrt(2) * noise.noise_m, noise.bias_m * math.sqrt(2 - 2 * kept)), rel=0.1
+    )
+    assert long > 2.0 * short
+
+
+@pytest.mark.parametrize("kind", ["exact", "wheel", "gps"])
+def test_odometry_is_the_same_for_the_same_seed(kind: str) -> None:
+    """And another for another, but where it has no error."""
+
+    def told(seed: int) -> Odometry | None:
+        return driven(odometer_for(kind, START, np.random.default_rng(seed)), straight(30.0))  # type: ignore[arg-type]
+
+    assert told(3) == told(3) and (told(3) == told(4)) == (kind == "exact")

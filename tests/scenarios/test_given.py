@@ -1,0 +1,107 @@
+"""What a policy is given in an episode, by the engines: goals that are pictures, further cameras, and no secret."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.state import Command, People, RobotState, Street
+from cosim.episode.driver import Driver
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.spec.goal import ImageGoal, PointGoal
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Scenario
+from scenarios.checks import small_scenario
+from scenarios.execution.episode import Episode
+from tests.reachable import leaks
+
+pytestmark = pytest.mark.engine
+
+SPEC = CameraSpec(64, 48, depth=True, labels=True)
+ALL = Manifest("all", camera=SPEC, goal="image", odometry="wheel", cameras={"left": CameraSpec(48, 32, mount="left")})
+SEED = EpisodeOptions(seed=11)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    """A second of a long way in a small city."""
+    return msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
+
+
+class Ahead:
+    """Drives straight on, and keeps what it is given."""
+
+    def __init__(self, manifest: Manifest) -> None:
+        self.manifest = manifest
+        self.seen: list[Observation] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        self.seen.append(observation)
+        return Command(1.0, 0.0)
+
+
+def test_what_is_given_in_an_episode_holds_no_secret_and_is_what_it_says(scenario: Scenario) -> None:
+    """Everything that a manifest can ask for but knowledge, after a second among people: nothing that only the
+    simulator knows is reached from it, before its driver copies it and after. The goal is the picture of the place 20 m
+    along the route with nobody there: with somebody in it it is another."""
+    policy = Ahead(ALL)
+    driver = Driver(policy)
+    with Episode(scenario, ALL, SEED) as episode, episode.eyes(SPEC) as camera:
+        first = seen = episode.reset()
+        while not episode.over:
+            now, seen = episode.moment, episode.advance(driver.act(seen))
+        assert len(now.street.people) > 5
+        for one in (first, seen, *policy.seen):
+            assert leaks(one, scenario, episode.moment) == [] == leaks(one, scenario, now)
+        place = scenario.route_line.at(20.0)
+        z_m, _, _ = episode._open.parts.world.surface.lean(place, seen.robot.drive.span_m)  # type: ignore[attr-defined]
+        robot = RobotState(place, z_m=z_m)
+        ahead = place.xy + 3.0 * np.array([np.cos(place.heading_rad), np.sin(place.heading_rad)])
+        somebody = People.of(("a",), [ahead], [0.0], [0.0], ("stand",))
+        empty, met = (
+            camera.render(robot, Street(0, people)).rgb for people in (People.of((), [], [], [], ()), somebody)
+        )
+    assert isinstance(first.goal, ImageGoal) and np.array_equal(first.goal.rgb, empty)
+    assert (first.goal.rgb != met).any(axis=-1).mean() > 0.02
+    assert first.depth is not None and first.depth.shape == (48, 64) and first.labels is not None
+    assert 1.0 < float(np.median(first.depth)) < 160.0 and len(np.unique(first.labels)) > 2
+    assert first.pictures["left"].rgb.shape == (32, 48, 3) and first.pictures["left"].depth is None
+    assert seen.odometry is not None and 0.1 < seen.odometry.x_m < 1.0
+
+
+def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(scenario: Scenario) -> None:
+    """The same seed gives the same points, another others; the option goes before the manifest, and stands in the
+    record; hashes, and the robot's pictures where its goal is one, too, are those of an episode without goals."""
+    records, pictures, points = [], [], []
+    for goal, seed in (("none", 1), ("random_point", 1), ("random_point", 1), ("random_point", 2), ("image", 1)):
+        options = EpisodeOptions(seed=seed, goal=goal)  # type: ignore[arg-type]
+        with Episode(scenario, Manifest("seeing", camera=CameraSpec(48, 32), goal="final_point"), options) as episode:
+            seen = [episode.reset()]
+            while not episode.over:
+                seen.append(episode.advance(Command(1.0, 0.0)))
+            records.append(episode.result()[0])
+        pictures.append([one.rgb.tobytes() for one in seen if one.rgb is not None])
+        points.append([(one.goal.x_m, one.goal.y_m) for one in seen if isinstance(one.goal, PointGoal)])
+    assert [record.goal_protocol for record in records] == ["none", *["random_point"] * 3, "image"]
+    assert len({record.state_hash for record in records}) == 1
+    assert pictures[0] == pictures[1] == pictures[4]
+    assert points[0] == points[4] == [] and points[1] == points[2] and points[1][0] != points[3][0]
+
+
+def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
+    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level ground."""
+    with Episode(scenario, ALL, SEED) as episode:
+        seen = episode.reset()
+        z_m = episode.moment.robot.z_m
+        lean = np.array(episode._open.parts.world.surface.lean(scenario.start_pose, seen.robot.drive.span_m)[1:])  # type: ignore[attr-defined]
+    assert seen.camera is not None and seen.depth is not None and seen.labels is not None
+    assert np.abs(lean).max() < 0.01, "a start on a slope tells nothing here"
+    rows, columns = np.nonzero((seen.labels == 2) & (seen.depth < 8.0))
+    rays = np.linalg.inv(seen.camera.matrix) @ np.stack([columns, rows, np.ones_like(rows)])
+    points = seen.camera.on_robot @ np.vstack([rays * seen.depth[rows, columns], np.ones_like(rows)])
+    assert len(rows) > 50 and abs(z_m) < 1.0
+    assert np.abs(np.median(points[2])) < 0.03 and np.percentile(np.abs(points[2]), 90) < 0.06
