@@ -34,7 +34,8 @@ _LEAVES_RAD: Final = 1.7
 _PAST_M: Final = 1.4
 """until it walks away, and is so far behind or off: who is still beside the robot may turn to it anew,"""
 _WAITS_S: Final = 7.0
-"""or the robot has waited so long."""
+_SAME_PLACE_M: Final = 0.5
+"""or the robot has been in the same place for so long."""
 
 
 def walks(people: People) -> Floats:
@@ -89,10 +90,11 @@ def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple
 
 
 class Yielding:
-    """Whom the robot stands for: those who came straight at it, until they are past, and no longer than _WAITS_S."""
+    """Whom the robot stands for: who came straight at it, until past it; no longer than _WAITS_S in one place."""
 
     def __init__(self) -> None:
-        self._for: dict[str, float] = {}
+        self._for: set[str] = set()
+        self._at, self._since_s = (math.inf, math.inf), 0.0
 
     def waits(self, known: Privileged, time_s: float) -> bool:
         """Whether the robot is to stand now."""
@@ -105,7 +107,8 @@ class Yielding:
         near = (far < _COMES_M) & (ahead > -_PAST_M)
         comes = near & ~who_stands(people) & (off < _COMES_RAD) & (ahead > 0.5 * far)
         passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
-        for row in np.flatnonzero(comes):
-            self._for.setdefault(people.ids[row], time_s)
-        waited = [self._for.get(people.ids[row], -math.inf) for row in np.flatnonzero(passing)]
-        return any(time_s - since < _WAITS_S for since in waited)
+        if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
+            self._at, self._since_s = pose[:2], time_s
+        self._for.update(people.ids[row] for row in np.flatnonzero(comes))
+        waits = any(people.ids[row] in self._for for row in np.flatnonzero(passing))
+        return waits and time_s - self._since_s < _WAITS_S
