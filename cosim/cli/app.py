@@ -74,6 +74,7 @@ def common(
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
     "`cosim run long-horizon --policy route --episodes 2 --counterfactual`",

@@ -64,7 +64,8 @@ class Driver:
         source_hash: str = "",
         timer: Timer | None = None,
     ) -> None:
-        self.manifest = policy.manifest if manifest is None else manifest
+        manifest = policy.manifest if manifest is None else manifest
+        self.manifest = replace(manifest, cameras=dict(manifest.cameras))
         self.source_hash = source_hash
         self._policy = policy
         self._timer: Timer = Untimed() if timer is None else timer

@@ -18,6 +18,7 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
 from cosim.episode.driver import Driver, Timer, told_of
+from cosim.episode.given import with_goal
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
 
@@ -95,12 +96,14 @@ def _checked(name: str, policy: Policy) -> Manifest:
     if lacking:
         raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.episode.ports.Policy")
     try:
+        with_goal(manifest, None)
         manifest = msgspec.convert(msgspec.to_builtins(manifest), Manifest)
         Clock.for_rate(manifest.rate_hz)
-        if wrong := _wrong(manifest):
-            raise UsageError(f"policy '{name}': its manifest's {wrong}")
-    except (msgspec.ValidationError, SpecError, TypeError, ValueError, OverflowError) as error:
+        wrong = _wrong(manifest)
+    except (msgspec.ValidationError, SpecError, UsageError, TypeError, ValueError, OverflowError) as error:
         raise UsageError(f"policy '{name}': its manifest: {error}") from error
+    if wrong:
+        raise UsageError(f"policy '{name}': its manifest's {wrong}")
     return manifest
 
 

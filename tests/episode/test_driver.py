@@ -17,7 +17,9 @@ from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
 from cosim.episode.driver import BatchDriver, Driver, PolicyCall
-from cosim.episode.ports import Manifest, Observation, Privileged, WaypointRule
+from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
+from cosim.spec.goal import ImageGoal, RoutePatch
+from cosim.spec.picture import Calibration, CameraPicture
 from cosim.spec.robot import COURIER
 
 MINE = Manifest("mine", camera=None)
@@ -293,6 +295,33 @@ def test_the_first_answer_of_any_episode_of_a_batch_may_take_longer() -> None:
     batch.act_batch([one, two])
     puts = [doing for doing, _ in itertools.groupby(asked)]
     assert puts == ["first act", "act", "first act", "act", "reset", "first act"]
+
+
+def test_what_a_policy_writes_into_its_goal_and_further_pictures_nobody_sees() -> None:
+    """Goals that are pictures or patches, depth, labels, pictures of further cameras: copies; and its manifest is what
+    it was, whatever it adds to the one of its class."""
+    ones, grey = np.ones((4, 4), np.uint8), np.full((4, 4, 3), 7, np.uint8)
+    calibration = Calibration(np.eye(3), np.zeros(5), np.eye(4))
+    left = CameraPicture(grey, ones, ones.astype(np.float32), calibration)
+    whole = dataclasses.replace(seen(), depth=ones.astype(np.float32), labels=ones, pictures={"left": left})
+    manifest = dataclasses.replace(MINE, cameras={})
+
+    def scribbles(observation: Observation) -> Command:
+        goal, own = observation.goal, observation.pictures["left"]
+        assert isinstance(goal, ImageGoal | RoutePatch) and own.depth is not None and own.labels is not None
+        for array in (goal.rgb if isinstance(goal, ImageGoal) else goal.pixels, observation.depth, observation.labels,
+                      own.rgb, own.depth, own.labels):  # fmt: skip
+            assert array is not None
+            array[:] = 99
+        observation.pictures["right"] = own  # type: ignore[index]
+        manifest.cameras["mast"] = CameraSpec(mount="mast")  # type: ignore[index]
+        return STILL
+
+    driver = Driver(Fake(scribbles, manifest))
+    for goal in (ImageGoal(grey), RoutePatch(ones)):
+        driver.act(dataclasses.replace(whole, goal=goal))
+    assert (grey == 7).all() and (ones == 1).all() and (left.depth == 1).all() and (whole.depth == 1).all()
+    assert set(whole.pictures) == {"left"} and driver.manifest.cameras == {}
 
 
 def put_back(name: str, tick: int) -> Observation:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 
 import msgspec
 import numpy as np
@@ -18,6 +19,7 @@ from cosim.records.results import table_row
 from cosim.spec.goal import GOALS, Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
 from cosim.spec.robot import COURIER, Mount
 from cosim.spec.scenario import City, RouteCrossing, Scenario
+from scenarios.catalog import load_suite
 
 CORNER = ((0.0, 0.0), (40.0, 0.0), (40.0, 60.0))
 NORTH = 0.5 * math.pi
@@ -150,6 +152,18 @@ def test_an_instruction_tells_turns_and_crosswalks_before_they_come() -> None:
     assert words[68.0] == words[79.5] == "Cross the street at the crosswalk."
 
 
+def test_instructions_tell_turns_and_crosswalks_alone() -> None:
+    """On every metre of the long ways of a suite: no number but the metres to the next turn or crosswalk, to 5 m and at
+    most 20; no word of people, events or where the goal is."""
+    what = r"((turn|bear) (left|right)|cross the street at the crosswalk)"
+    told = re.compile(rf"(Follow the sidewalk\.|{what}\.( {what}\.)*)( In (5|10|15|20) m, {what}\.)?", re.IGNORECASE)
+    heard = set()
+    for one in load_suite("long-horizon").scenarios[:12]:
+        ways = manoeuvres(one.route_line, one.crossings)
+        heard |= {told_at(s_m, ways) for s_m in np.arange(0.0, one.route_line.length_m).tolist()}
+    assert [text for text in heard if not told.fullmatch(text)] == [] and len(heard) > 8
+
+
 @pytest.mark.parametrize(
     ("route", "told"),
     [
@@ -234,3 +248,8 @@ def test_a_camera_is_told_as_computer_vision_has_it() -> None:
     focal = 24.0 / math.tan(math.radians(30.0))
     assert (camera.matrix @ [x, y, z] / z)[:2] == pytest.approx((31.5 + focal * x / z, 23.5 + focal * y / z))
     assert camera.distortion.tolist() == [-0.1, 0.02, 0.0, 0.0, 0.0]
+    aside = Mount((0.1, 0.25, 0.5), 0.0, yaw_left_deg=90.0)
+    left = calibration_of(CameraSpec(64, 48, 60.0, aside, crop=(8, 10, 64, 48)), COURIER)
+    seen = np.linalg.inv(left.on_robot) @ [0.1, 3.25, 0.5, 1.0]  # 3 m to the left of it: on its axis
+    assert seen[:3] == pytest.approx((0.0, 0.0, 3.0), abs=1e-12)
+    assert (left.matrix @ seen[:3] / seen[2])[:2] == pytest.approx((31.5 - 8.0, 23.5 - 10.0))

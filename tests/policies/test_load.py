@@ -62,6 +62,22 @@ BAD = {
         GOOD.replace("{fields}", ", camera=CameraSpec(96, 96, crop=(0, 0, 97, 96))"),
         "camera crop must be (x0, y0, x1, y1) within 96 x 96 pixels, x0 < x1 and y0 < y1, not (0, 0, 97, 96)",
     ),
+    "no-such-goal": (
+        GOOD.replace("{fields}", ", goal='route'"),
+        "unknown goal protocol 'route'. Valid choices: final_p",
+    ),
+    "no-such-odometry": (
+        GOOD.replace("{fields}", ", odometry='imu'"),
+        "unknown odometry 'imu'. Valid choices: exact, gps",
+    ),
+    "image-for-the-blind": (
+        GOOD.replace("{fields}", ", camera=None, goal='image'"),
+        "has no camera, and goal protocol",
+    ),
+    "no-pixels-left": (
+        GOOD.replace("{fields}", ", cameras={'left': CameraSpec(0, 96)}"),
+        "sides of 1 to 4096 pixels, not 0 x 96",
+    ),
     "lost-mount": (
         GOOD.replace("{fields}", ", camera=CameraSpec(mount=Mount((0.0, float('inf'), 0.0)))"),
         "mount at_m, pitch_down_deg and yaw_left_deg must be finite",

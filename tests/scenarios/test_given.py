@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
+from cosim.core.errors import RunError
 from cosim.core.state import Command, People, RobotState, Street
 from cosim.episode.driver import Driver
 from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.records.run_folder import read_spec
 from cosim.spec.goal import ImageGoal, PointGoal
 from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import Scenario, Suite
 from scenarios.checks import small_scenario
 from scenarios.execution.episode import Episode
+from scenarios.execution.suite_run import run
 from tests.reachable import leaks
 
 pytestmark = pytest.mark.engine
@@ -90,6 +95,22 @@ def test_goals_are_drawn_from_the_runs_seed_and_change_nothing_in_the_street(sce
     assert len({record.state_hash for record in records}) == 1
     assert pictures[0] == pictures[1] == pictures[4]
     assert points[0] == points[4] == [] and points[1] == points[2] and points[1][0] != points[3][0]
+
+
+def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
+    """They stand in its rows and in run.json; who resumes it with others is refused, with both names."""
+    suite = Suite(name="one", version="1", scenarios=(scenario,))
+    policy, given = Ahead(Manifest("ahead", camera=None, odometry="gps")), EpisodeOptions(seed=2, goal="route_point")
+    table = run(suite, policy, out=tmp_path / "run", options=given)
+    assert table[["goal_protocol", "odometry", "privileged"]].to_numpy().tolist() == [["route_point", "gps", False]]
+    assert all(isinstance(one.goal, PointGoal) and one.odometry is not None for one in policy.seen) and policy.seen
+    spec = read_spec(tmp_path / "run")
+    assert (spec.goal_protocol, spec.odometry) == ("route_point", "gps")
+    for goal, named in (("final_point", "now asked for is final_point"), (None, "now asked for is none")):
+        other = EpisodeOptions(seed=2, goal=goal)  # type: ignore[arg-type]
+        with pytest.raises(RunError, match=f"is of another run: its goal_protocol is route_point, {named}"):
+            run(suite, policy, out=tmp_path / "run", resume=True, options=other)
+    assert len(run(suite, policy, out=tmp_path / "run", resume=True, options=given)) == 1
 
 
 def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
