@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from cosim.core.geometry import Floats, wrap_angles
-from cosim.core.state import PERSON_RADIUS_M, People
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
 from cosim.episode.ports import Privileged
 from cosim.policies.body import BodyDisks
 from cosim.policies.foresight import STEP_TIMES_S, Ahead
@@ -29,7 +29,7 @@ _SOON: Final = 4
 """Who is so near is foreseen to stay there, too, for so many steps."""
 _COMES_M: Final = 4.5
 _COMES_RAD: Final = 0.12
-"""Who ahead walks at the robot so exactly, and is so near, is waited for,"""
+"""Who ahead walks at the robot so exactly, and is so near, is waited for (not the crowd, which would wait too),"""
 _LEAVES_RAD: Final = 1.7
 _PAST_M: Final = 1.4
 """until it walks away, and is so far behind or off: who is still beside the robot may turn to it anew,"""
@@ -105,7 +105,7 @@ class Yielding:
         off = np.abs(wrap_angles(people.heading - np.arctan2(-offset[:, 1], -offset[:, 0])))
         ahead = offset @ [cos, sin]
         near = (far < _COMES_M) & (ahead > -_PAST_M)
-        comes = near & ~who_stands(people) & (off < _COMES_RAD) & (ahead > 0.5 * far)
+        comes = near & people.are(*DIRECTED) & ~who_stands(people) & (off < _COMES_RAD) & (ahead > 0.5 * far)
         passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
         if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
             self._at, self._since_s = pose[:2], time_s

@@ -12,7 +12,7 @@ import pytest
 from shapely.geometry import box
 
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import NO_VEHICLES, Doing, People, RobotState, Signal, Vehicles
+from cosim.core.state import NO_VEHICLES, Doing, People, PersonKind, RobotState, Signal, Vehicles
 from cosim.episode.driver import Driver
 from cosim.episode.ports import Observation, Privileged
 from cosim.policies.body import BodyDisks
@@ -34,7 +34,8 @@ def people(*rows: tuple[float, float, float, float, Doing]) -> People:
     """Of (x, y, heading, speed, doing)."""
     xy = [row[:2] for row in rows]
     ids = tuple(f"e{i}" for i in range(len(rows)))
-    return People.of(ids, xy, [r[2] for r in rows], [r[3] for r in rows], tuple(r[4] for r in rows))
+    doing = tuple(r[4] for r in rows)
+    return People.of(ids, xy, [r[2] for r in rows], [r[3] for r in rows], doing, kind=PersonKind.EVENT)
 
 
 def known(others: People, x_m: float = 5.0, v_mps: float = 1.2, half_width_m: float = 1.7) -> Privileged:
