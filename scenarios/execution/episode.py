@@ -59,8 +59,9 @@ class Episode:
     when it stands still. through: may put stopwatches or stand-ins before the engines, which have started and not
     begun. kinds: the table of events that there may be.
 
-    Raises UsageError for a camera that the robot does not have and when it is used out of turn, PolicyError for an
-    answer that is no command, EngineError when an engine fails or runs already, and what its place raises.
+    Raises UsageError for a camera that the robot does not have, for goals that the policy cannot be given and when it
+    is used out of turn, PolicyError for an answer that is no command, EngineError when an engine fails or runs already,
+    and what its place raises.
 
     >>> from cosim import load_policy, load_suite
     >>> policy = load_policy("straight")

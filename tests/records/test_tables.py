@@ -152,7 +152,7 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         "reason": "",
         "camera": "own mount, 64 x 64 px, 75 deg",
     }
-    row |= {"goal_protocol": "route_point", "odometry": "gps"}
+    row |= {"goal_protocol": "route_point", "odometry": "gps", "privileged": True}  # type: ignore[dict-item]
     row |= {"rate_hz": 4.0, "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped", "run_seed": 7}  # type: ignore[dict-item]
     row = dict.fromkeys(METRICS, 1.0) | {name: 1.0 for name, _ in (*SHOWN, *COUNTS)} | row  # type: ignore[assignment]
     for odd, star in (("a camera of its own", True), ("", False)):
@@ -160,7 +160,7 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
         text = " ".join(said.getvalue().split())
         assert (
-            "camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; odometry gps; waypoint 2, units of 1 m, "
-            "in 0.25 s, shipped; seed 7" in text
+            "camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; odometry gps; privileged; waypoint 2, "
+            "units of 1 m, in 0.25 s, shipped; seed 7" in text
         )
         assert ("s-1*" in text) is ("* nonstandard, not to be compared: a camera of its own" in text) is star
