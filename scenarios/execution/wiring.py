@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
-from cosim.core.errors import SpecError
+from cosim.core.errors import MachineError, SpecError
 from cosim.core.geometry import Pose
 from cosim.core.state import RobotState, Street
 from cosim.episode.loop import Moment, Parts
@@ -152,7 +152,10 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
     robot, start_xy = robot_called(scenario.robot), scenario.start[:2]
     if goes_by_itself(street_map, scenario.crowd, before):
         return EmptyStreet(street_map, scenario.seed, start_xy)
-    from sumo_nets.crowd.crowd import SumoCrowd  # with SUMO
+    try:
+        from sumo_nets.crowd.crowd import SumoCrowd  # with SUMO
+    except (ImportError, OSError) as error:
+        raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
 
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
     return SumoCrowd(

@@ -15,7 +15,7 @@ from socket import socket
 from typing import TYPE_CHECKING
 
 from cosim.core.clock import Clock
-from cosim.core.errors import RendererLost, UsageError
+from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
@@ -65,7 +65,11 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
             return
         os.chdir(home)  # the policy may have gone elsewhere
         driver = driver or driver_here(hello, timer, say, again=True)
-        done, trouble = run_job(job, driver, say)
+        try:
+            done, trouble = run_job(job, driver, say)
+        except MachineError as lack:
+            say(Unable(str(lack), blames_policy=False))
+            raise
         if trouble:
             driver = None  # made anew for the next one
         say(done)

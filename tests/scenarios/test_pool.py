@@ -98,7 +98,7 @@ def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk
         patch.setenv("PYTHONPATH", path)
         code, said = run(fresh_cosim, desk, "Mine")
     assert (code, said.count("error:")) == (3, 1)
-    assert "an environment process cannot start: libX11.so.6: cannot open shared object" in said
+    assert "SUMO cannot be loaded: libX11.so.6: cannot open shared object" in said
 
 
 @pytest.mark.parametrize("printed", [0, 10, 100, 101, 150, 200, 201, 1000])
