@@ -25,7 +25,7 @@ def load_suite(name: str) -> Suite:
     Raises UsageError with the valid names, SpecError naming the file and the field.
 
     >>> load_suite("long-horizon").scenarios[0].id
-    'lh-011-00'
+    'lh-001-00'
     """
     if name.endswith(".json"):
         return read_suite(Path(name), EVENT_KINDS)

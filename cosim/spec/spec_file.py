@@ -14,7 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get
 import msgspec
 
 from cosim.core.errors import SpecError
-from cosim.spec.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of
+from cosim.spec.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
 
 MOST_BYTES: Final = 1_000_000_000
 MOST_TOLD: Final = 5
@@ -126,6 +126,8 @@ def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
     if found:
         yield from _out_of_range(tree, _bare(kind, tree), place)
     else:
+        if isinstance(tree, str):
+            message = message.replace(f"'{tree}'", shown(tree))
         yield f"{printable(_PLACE.sub('', message), MOST_LETTERS)} - at `{place}`{_choices(kind, tree)}"
 
 

@@ -9,6 +9,7 @@ import pytest
 from rich.console import Console
 
 from cosim.cli.board import SETUP_M, Board, Left
+from cosim.core.telling import duration
 from scenarios.catalog import load_suite
 from scenarios.execution.messages import Compares, Done, Progress
 
@@ -50,7 +51,7 @@ def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
     board.tell(Done(LONG[1].id, "done"))
     (line,) = said.getvalue().splitlines()
     rest_m, gone_m = LONG[2].route_line.length_m + SETUP_M, LONG[1].route_line.length_m + SETUP_M
-    assert line == f"{LONG[1].id}: done, 2 of 3; about {round(40.0 * rest_m / gone_m, -1):.0f} s left"
+    assert line == f"{LONG[1].id}: done, 2 of 3; about {duration(40.0 * rest_m / gone_m)} left"
     clock.now_s = 160.0
     board.tell(Done(LONG[2].id, "crashed"))
     assert said.getvalue().splitlines()[1] == f"{LONG[2].id}: crashed, 3 of 3"
@@ -93,5 +94,6 @@ def test_the_bars_fit_80_columns() -> None:
     Console(file=said, width=80).print(board.bars.get_renderable())
     lines = said.getvalue().splitlines()
     assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
-    assert any("ped_crossing-001" in line and "630/637 m" in line and "88 failures" in line for line in lines)
+    way = f"630/{LONG[7].route_line.length_m:.0f} m"
+    assert any("ped_crossing-001" in line and way in line and "88 failures" in line for line in lines)
     assert any("episodes" in line and "0/3" in line and "left" in line for line in lines)

@@ -119,10 +119,10 @@ def test_the_sheet_of_events_fits_80_columns() -> None:
 
 
 def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
-    """A hundred and sixty scenarios are no answer to a slip of the pen: five are, and how many there are."""
+    """Nine hundred scenarios are no answer to a slip of the pen: five are, and how many there are."""
     names = [scenario.id for scenario in load_suite("reactive").scenarios]
     assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
-    assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 160" in str(
+    assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 900" in str(
         unknown("scenario", "x", names)
     )
 

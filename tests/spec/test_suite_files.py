@@ -25,7 +25,7 @@ PLACE = re.compile(r"`\$[\w.\[\]]*`|line \d+, byte \d+ of it|`scenarios` needs|n
 
 def sound() -> dict[str, Any]:
     """The file of a suite of three: a long way with barriers, crossings and events, and two short ones with groups."""
-    chosen = [load_suite("long-horizon").scenarios[0]]
+    chosen = [s for s in load_suite("long-horizon").scenarios if s.id == "lh-037-00"]
     chosen += [s for s in load_suite("reactive").scenarios if s.id in ("ped_crossing-001", "conversing-001")]
     return json.loads(msgspec.json.encode(Suite(name="sound", version="1", scenarios=tuple(chosen))))  # type: ignore[no-any-return]
 
@@ -91,8 +91,8 @@ OUT_OF_RANGE: tuple[tuple[tuple[str | int, ...], object, str], ...] = (
     (("first", "barriers", 0, "x_m"), -math.inf, "barrier x_m must be in [-10000000, 10000000], not -inf"),
     (("first", "barriers", 0, "strip"), "s\x1b[2J", r"barrier strip must be at most 200 letters and no control"),
     (("first", "crossings", 0, "leave_s_m"), 0.0, "comes after leave_s_m 0.0"),
-    (("first", "crossings", 0, "leave_s_m"), 9e3, "leave_s_m is 9000, but the route ends at 183.155"),
-    (("first", "events", 0, "route_s_m"), 9e3, "route_s_m is 9000, but the route ends at 183.155"),
+    (("first", "crossings", 0, "leave_s_m"), 9e3, "leave_s_m is 9000, but the route ends at 303.191"),
+    (("first", "events", 0, "route_s_m"), 9e3, "route_s_m is 9000, but the route ends at 303.191"),
     (("first", "events", 0, "half_width_m"), 1e9, "half_width_m must be in (0.3, 50], not 1000000000.0"),
     (("first", "events", 0, "id"), "e <x>", "event id 'e <x>': ids of event pedestrians start with 'e'"),
     (("first", "events", 0, "kind"), "ambush", "Invalid enum value 'ambush' - at `$.scenarios[0].events[0].kind`. V"),
