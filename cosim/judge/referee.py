@@ -17,7 +17,7 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   passing the pedestrian ends it badly.
 - After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing, at an
   obstacle nor at the goal), heading along it; after 3 failures within 10 m of the route, at the first free one at
-  least 1 m beyond them.
+  least 1 m beyond them, or between waypoints where none is.
 - The jump counts neither as travel nor as progress.
 """
 
@@ -54,6 +54,8 @@ FREE_OF_OBSTACLES_M = 0.1
 _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
+_BETWEEN_M = 0.5
+"""Where no waypoint beyond is free, as before the goal, places so far apart are tried."""
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
 STOP_S = 2.0
@@ -244,11 +246,14 @@ class Referee:
         last_m = max(self._route.length_m - 2 * self._scenario.goal_radius_m, 0.0)
         waypoints = np.arange(count, dtype=np.float64) * WAYPOINT_STEP_M
         waypoints = waypoints[waypoints <= last_m]
-        if self._scenario.obstacles:
-            waypoints = self._clear(waypoints)
+        clear = self._clear(waypoints)
+        waypoints = clear if len(clear) else waypoints
         if stuck:
             self._failed_at_s.clear()
-            order = waypoints[waypoints > max(recent) + _BEYOND_M]
+            begin_m = max(recent) + _BEYOND_M
+            order = np.concatenate(
+                [waypoints[waypoints > begin_m], self._clear(np.arange(begin_m, last_m, _BETWEEN_M))]
+            )
         else:
             order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
         for s_m in order:
@@ -259,10 +264,11 @@ class Referee:
         return Reset(self._route.at(s_m), s_m)
 
     def _clear(self, waypoints: Floats) -> Floats:
-        """Those at which the robot can turn on the spot between the obstacles; all where there is none."""
+        """Those at which the robot can turn on the spot between the obstacles."""
+        if not self._scenario.obstacles or not len(waypoints):
+            return waypoints
         at = shapely.points([self._route.at(s_m).xy for s_m in waypoints.tolist()])
-        clear = waypoints[shapely.distance(at, self._obstacles) > math.hypot(*self._half_m) + FREE_OF_OBSTACLES_M]
-        return clear if len(clear) else waypoints
+        return waypoints[shapely.distance(at, self._obstacles) > math.hypot(*self._half_m) + FREE_OF_OBSTACLES_M]
 
     def _free(self, pose: Pose, s_m: float, step: Step) -> bool:
         if any(c.enter_s_m - self._half_m[0] < s_m < c.leave_s_m + self._half_m[0] for c in self._scenario.crossings):

@@ -250,6 +250,14 @@ def test_a_reset_keeps_off_obstacles() -> None:
     assert reset_m(*(bin_at(5.0 * k) for k in range(21))) == 20.0
 
 
+def test_who_hits_what_stands_before_the_goal_is_put_between_it_and_the_goal() -> None:
+    """Beyond the last waypoint there is room still: else it would be put before the same bin until the time is up."""
+    one = referee(obstacles=(Obstacle(kind="bin", x_m=96.0, y_m=0.0, heading_rad=0.0),))
+    hit = [touch("bin", "object")]
+    at = [one.judge(step(60 * t, 95.3, contacts=hit)).reset for t in range(3)]
+    assert [reset.route_s_m for reset in at if reset is not None] == [95.0, 95.0, 96.8]
+
+
 def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
     """Waypoints lie every 5 m; one where a person stands is passed over, and so is one on a crossing."""
     crossing = RouteCrossing(id=":x_c0", enter_s_m=28.0, leave_s_m=36.0, signalised=False)
