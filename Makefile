@@ -17,7 +17,7 @@ help:
 	@echo "make clean  remove the virtual environment and caches"
 
 run: .venv/run.stamp | machine
-	@$(BIN)/cosim run long-horizon --policy route --episodes 2 --jobs $(JOBS)
+	@$(BIN)/cosim run long-horizon --policy orca --episodes 2 --jobs $(JOBS)
 
 test: .venv/dev.stamp | machine
 	@$(BIN)/python -m pytest -m "not engine" -n $(JOBS) --dist loadfile

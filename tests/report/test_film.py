@@ -152,7 +152,7 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("film", "run", "t-0", "--view", "inside"), "unknown view"),
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
-        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 172, among them"),
+        (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 1335, among them"),
         (("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"), "use a name that ends in .png or .jpg"),
         (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import msgspec
 import numpy as np
 import pytest
 import shapely
@@ -18,6 +17,7 @@ from cosim.spec.scenario import City, content_hash
 from scenarios.builders import long_horizon
 from scenarios.builders.barriers import barrier_at, branches, outline, prove_single_path
 from scenarios.builders.hems import MOST, hem
+from scenarios.builders.recipes import RECIPES, candidate
 from scenarios.catalog import load_suite
 from scenarios.execution.places import place
 from tests.scenarios.test_scenarios import cross_map
@@ -105,9 +105,7 @@ def test_where_no_draw_fits_a_way_is_searched_for_and_hemmed(
 def test_shipped_routes_are_drawn_again_to_the_bit() -> None:
     """Where a draw fits, the search changes nothing."""
     shipped = {s.id: s for s in load_suite("long-horizon").scenarios}
-    for name in ("lh-011-00", "lh-011-02"):
-        scenario = shipped[name]
-        where = msgspec.structs.replace(scenario.place, net_hash="")
-        _, street_map = place(where)
-        drawn = long_horizon.build_long_horizon(where, street_map, WalkGraph(street_map), scenario.seed, name)
-        assert content_hash(drawn) == content_hash(scenario)
+    for slot in RECIPES["long-horizon"].slots:
+        if slot.name in ("lh-011-00", "lh-037-00"):
+            scenario = shipped[slot.name]
+            assert content_hash(candidate(slot, scenario.seed)) == content_hash(scenario)

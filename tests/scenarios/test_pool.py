@@ -73,9 +73,9 @@ def desk(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(cosim: Cosim, desk: Path, name: str) -> tuple[int, str]:
+def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[int, str]:
     words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", "5", "--out", "run")
-    said = cosim("run", "reactive", *words, cwd=desk)
+    said = cosim("run", suite, *words, cwd=desk)
     assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
     assert "crashed" not in said.stdout + said.stderr
     return said.returncode, said.stderr
@@ -96,7 +96,7 @@ def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk
     path = os.pathsep.join([str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
-        code, said = run(fresh_cosim, desk, "Mine")
+        code, said = run(fresh_cosim, desk, "Mine", "long-horizon")
     assert (code, said.count("error:")) == (3, 1)
     assert "SUMO cannot be loaded: libX11.so.6: cannot open shared object" in said
 
