@@ -53,7 +53,7 @@ WITH_PEOPLE = (
     ("left_lane", "left\nlane"),
     ("broke_rule", "broke\nrule"),
     ("pedestrian_distance_min_m", "near-\nest m"),
-    ("pedestrian_distance_min_success_m", "of suc-\ncesses"),
+    ("pedestrian_distance_min_success_m", "of\nwins"),
 )
 """Means over the episodes of a kind: shares of them, and metres."""
 
@@ -230,7 +230,8 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
     out.print(shown)
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of these; nearest: least "
-        "distance to a person's centre, mean over episodes, and over those that succeeded; SPL success by path length"
+        "distance to a person's centre, mean over episodes, of wins: over those that succeeded; SPL success by path "
+        "length"
         if people
         else "n episodes that are scored; hit else, left lane: share of these; SPL success weighted by path length"
     )

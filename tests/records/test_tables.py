@@ -108,6 +108,16 @@ def test_the_table_by_kind_fits_80_columns() -> None:
     assert re.search(r"^ ped_crossing +1 +0\.25 +0\.25\.\.0\.25 ", said.getvalue(), re.MULTILINE)
 
 
+def test_a_whole_suite_by_kind_fits_80_columns_with_all_its_headings() -> None:
+    """A hundred episodes of each event: neither a heading nor a number is cut."""
+    table, kinds = pair_of_kinds()
+    whole = pd.concat([table] * 100, ignore_index=True)
+    out, said = terminal()
+    print_by_kind(out, whole, kinds)
+    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
+    assert re.search(r"^ ped_crossing +100 ", said.getvalue(), re.MULTILINE)
+
+
 def test_the_sheet_of_events_fits_80_columns() -> None:
     """A long map's name and two digits before each point: numbers and headings are whole."""
     row = ("sumo-fokr-bs-demo-003 12", "ped_crossing", -19.98, 0.123, 0.060, 1.65, 1.65, -12.34, -180.0, 12.34)
