@@ -19,6 +19,7 @@ from cosim.cli.city import city_app
 from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, CROWD_HELP, ELDERLY_HELP, GROUPS_HELP, VEHICLES_SHARE, compare_one
 from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, ROBOT_HELP, Choice, camera_here, export, film, look
+from cosim.cli.latency import LATENCY_HELP, REAL_TIME_HELP, with_latency
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
@@ -75,6 +76,7 @@ def common(
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
+    "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
     "`cosim run long-horizon --policy route --episodes 2 --counterfactual`",
@@ -104,6 +106,8 @@ def run_command(
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
     goal: Annotated[str, typer.Option(help=GOAL_HELP)] = "",
+    latency: Annotated[str, typer.Option(metavar="MS", help=LATENCY_HELP)] = "",
+    real_time: Annotated[bool, typer.Option("--real-time", help=REAL_TIME_HELP)] = False,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
     own_camera: Annotated[bool, typer.Option("--own-camera", help=OWN_CAMERA_HELP)] = False,
@@ -144,7 +148,7 @@ def run_command(
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
     from scenarios.execution.process import LocalProcesses
-    from scenarios.execution.suite_run import run_spec, seed_of_run
+    from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
     from scenarios.rendering.shared import SharedRenderer, check_shared
 
     if map_name is not None:
@@ -194,6 +198,8 @@ def run_command(
         director=outside,
         counterfactual=counterfactual,
     )
+    options = with_latency(options, latency, real_time, folder if resume else None, whole, picked[0], policy)
+    check_alone(options, jobs, shared_renderer)
     spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:
         if on_air is not None:

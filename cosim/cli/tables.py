@@ -128,6 +128,19 @@ def print_terms(out: Console, table: pd.DataFrame) -> None:
         out.print(f"camera {camera}, at {rate_hz:g} Hz; {told}{waypoints}; seed {seed}", highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
+    if words := _latency_in_words(table):
+        out.print(words, highlight=False, markup=False)
+
+
+def _latency_in_words(table: pd.DataFrame) -> str:
+    """How late commands took effect, where they did."""
+    if "latency_ms" not in table or not (table["latency_ms"].any() or table["real_time"].any()):
+        return ""
+    least, middle, most = (f"{table['latency_ms'].quantile(q):g}" for q in (0.0, 0.5, 1.0))
+    if not table["real_time"].any():
+        return f"latency {middle} ms: commands take effect so much later than what they answer"
+    told = f"latency of an episode's answers {middle} ms ({least} to {most} ms)"
+    return f"in real time: {told}, as measured here; not to be had again from the seed, only replayed"
 
 
 def print_names(out: Console) -> None:
@@ -175,6 +188,9 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
 def print_episode(out: Console, record: Record) -> None:
     """One episode in words: how it ended, every failure, every event, every metric."""
     out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
+    if record.latency_ms or record.real_time:
+        real = ", the median of what was measured: replayed, never made again" if record.real_time else ""
+        out.print(f"  commands took effect {record.latency_ms:g} ms after what they answer{real}", soft_wrap=True)
     for failure in record.failures:
         what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
         fault = f", {failure.fault}" if failure.fault else ""

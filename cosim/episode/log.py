@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from dataclasses import dataclass, fields
+from dataclasses import field as filled
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,9 @@ class Log:
     people_tick (P,), people_xy (P, 2), people_kind, people_age (P,) of `PersonKind` and `Age`: persons within 30 m,
     once a second, for pictures.
     event_tracks (E, 5): tick, event, person of it, x m, y m, from each event's trigger on.
+    answers (A, 4): the tick of an observation, the ticks until the policy's answer to it took effect, and the command
+    that it was, v m/s and w rad/s; what was on its way when the robot was put elsewhere never did
+    (`cosim.episode.in_flight`). Empty in a file that was written before there were any.
 
     `Log.load` reads the trajectory.npz of a run folder and raises RunError naming the file.
 
@@ -53,6 +57,7 @@ class Log:
     people_kind: NDArray[np.int8]
     people_age: NDArray[np.int8]
     event_tracks: Floats
+    answers: Floats = filled(default_factory=lambda: np.empty((0, 4)))
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -83,7 +88,7 @@ class Log:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 held = dict(arrays)
-                values = {name: held[name] for name in (f.name for f in fields(cls))}
+                values = {f.name: held[f.name] for f in fields(cls) if f.name in held or f.name != "answers"}
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RunError(f"{path}: not a trajectory: {error}") from error
         values["tick_s"] = float(values["tick_s"])

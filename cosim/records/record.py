@@ -61,7 +61,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     split, structure: of the scenario; crowd_added: its crowd is not the suite's own (`CrowdSpec.added`).
     policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
     walked_into: contacts with people who walked into the robot where it stood; no failures.
-    waypoints: how those that it answers were followed.
+    waypoints: how those that it answers were followed. latency_ms: of its commands, as asked for; in real_time the
+    median of those that were measured, and another one the next time: such a record is replayed, not made again.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     crashed: its policy crashed, which counts as a failure. invalid: what the simulator owes, counted apart: it came to
     its end without a failure, and its event had not happened or could not be seen; or an engine failed, twice. ended:
@@ -96,6 +97,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     goal_protocol: str
     odometry: OdometryKind = "none"
     privileged: bool = False
+    latency_ms: float = 0.0
+    real_time: bool = False
     renderer: str
     versions: dict[str, str]
     status: Status
@@ -140,8 +143,9 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def begun(
-    scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "", run_seed: int = 0
-) -> Record:
+    scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "", run_seed: int = 0,
+    latency_ms: float = 0.0, real_time: bool = False,
+) -> Record:  # fmt: skip
     """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
     return Record(
         scenario=scenario.id,
@@ -166,6 +170,8 @@ def begun(
         goal_protocol=manifest.goal,
         odometry=manifest.odometry,
         privileged=manifest.privileged,
+        latency_ms=latency_ms,
+        real_time=real_time,
         renderer=NO_RENDERER,
         versions=versions(),
         status="crashed",
@@ -237,8 +243,8 @@ class Recorder:
             for xy, kind, age in zip(people.xy.tolist(), people.kind.tolist(), people.age.tolist(), strict=True):
                 self._people.append((step.tick, *xy, kind, age))
 
-    def log(self, event_tracks: Floats) -> Log:
-        """The episode so far. event_tracks: see `Log`."""
+    def log(self, event_tracks: Floats, answers: Floats) -> Log:
+        """The episode so far. event_tracks, answers: see `Log`."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 16)
         people = np.array(self._people, dtype=float).reshape(-1, 5)
         return Log(
@@ -260,4 +266,5 @@ class Recorder:
             people_kind=people[:, 3].astype(np.int8),
             people_age=people[:, 4].astype(np.int8),
             event_tracks=event_tracks,
+            answers=answers,
         )

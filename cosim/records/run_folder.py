@@ -45,7 +45,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
     "versions", "renderer", "counterfactual", "waypoints", "seed",
-    "camera", "cameras", "rate_hz", "goal_protocol", "odometry",
+    "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -71,6 +71,8 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     rate_hz: float = 4.0
     goal_protocol: GoalProtocol = "none"
     odometry: OdometryKind = "none"
+    latency_ms: float = 0.0
+    real_time: bool = False
     seed: int = 0
     scenarios: tuple[str, ...]
     versions: dict[str, str]

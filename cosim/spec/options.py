@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import msgspec
 
+from cosim.core.errors import UsageError
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
 from cosim.spec.pseudonym import check_seed
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
 CameraChoice = Literal["auto", "gl", "bullet", "bullet-egl"]
+MOST_LATENCY_MS = 10_000.0
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
@@ -32,7 +35,8 @@ class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode is run. But for the robot, options change what is seen and kept, never what happens in the street.
+    """How an episode is run. But for robot and latency, options change what is seen and kept, never what happens in the
+    street.
 
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
     (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
@@ -43,7 +47,10 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it is on the air
     meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual: compare it with
     its street without the robot. injections: pedestrians that were injected into the episode that this one replays.
-    renderer: what draws for the policy in place of a camera of its own.
+    renderer: what draws for the policy in place of a camera of its own. latency_ms: each command takes effect so much
+    later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`). real_time: in
+    place of that, the time that the policy takes for an answer on this machine is that answer's latency, and it is not
+    asked again before: what comes out is replayed from its record, and not made again from its seed. Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -62,6 +69,12 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
     renderer: RendererAt | None = None
+    latency_ms: float = 0.0
+    real_time: bool = False
 
     def __post_init__(self) -> None:
         check_seed(self.seed)
+        if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MOST_LATENCY_MS):
+            raise UsageError(f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}")
+        if self.real_time and self.latency_ms:
+            raise UsageError("real_time measures the latency of every answer: leave latency_ms out")

@@ -23,10 +23,11 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, UsageError
-from cosim.core.state import STILL, Frame
+from cosim.core.state import Frame
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.control import command_of
 from cosim.episode.given import with_goal
+from cosim.episode.in_flight import InFlight, whole_ticks
 from cosim.episode.log import Log
 from cosim.episode.loop import Moment, after, begin, tick
 from cosim.episode.ports import CameraSpec, Eyes, Manifest, Observation
@@ -92,7 +93,8 @@ class Episode:
         run_seed = 0 if options.seed is None else options.seed
         self.id, self.seed = pseudonym_of(run_seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)
-        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source, run_seed)
+        late = options.latency_ms, options.real_time
+        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source, run_seed, *late)
         self._watches, self._waiting, self._through, self._kinds = list(watches), waiting, through, kinds
         self._began_s = time.perf_counter()
         self._setup_s = 0.0
@@ -102,6 +104,8 @@ class Episode:
         self._frame: Frame | None = None
         self._verdict = Verdict()
         self._was_reset = False
+        self._commands = InFlight()
+        self._asked_s = 0.0
         self._result: tuple[Record, Log] | None = None
 
     def __enter__(self) -> Self:
@@ -169,14 +173,16 @@ class Episode:
         if self._now is not None:
             raise UsageError("this Episode has begun: an episode cannot be begun anew, make another Episode for that")
         self._now = begin(self.scenario, stage.parts)
-        return self._observe(stage, self._now)
+        return self._observe(stage, self._now, True)
 
     def advance(self, answer: object, *, until_tick: int | None = None) -> Observation:
-        """Go on for one period of the policy with its answer; what it sees then, or at the end of the episode.
+        """Go on for one period of the policy with its answer; what it sees then, or at the end of the episode. In real
+        time it goes on until the answer has arrived, too, which took as long as the caller took to come here.
 
         answer: a Command or waypoints; see `cosim.episode.control.command_of`. until_tick: stop there, within the
         period, for somebody who wants to look.
         """
+        took_ms = 1000.0 * (time.perf_counter() - self._asked_s)
         stage, now = self._begun
         if self.over:
             raise UsageError(f"this Episode is over ({self._verdict.ended}): ask for its result(), or make another")
@@ -184,35 +190,42 @@ class Episode:
             command = command_of(answer, rule=self.manifest.waypoints, robot=stage.robot)
         except PolicyError as error:
             raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
-        frame = self._frame
+        options, frame = self.options, self._frame
+        latency_ms = took_ms if options.real_time else options.latency_ms
+        self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
+        free_again = self._commands.arrived_by if options.real_time else 0
         while True:
-            step = tick(self.scenario, self.clock, stage.parts, now, command, frame)
+            step = tick(self.scenario, self.clock, stage.parts, now, self._commands.at(now.tick), frame)
             self._verdict = verdict = stage.scorer.score(step)
             for watch in self._watches:
                 watch(step, verdict)
             self._now = now = after(step, verdict.reset, stage.parts)
             self._was_reset |= verdict.reset is not None
             stage.observer.moved(step, verdict.reset is not None)
-            if self.over or self.clock.acts(now.tick) or now.tick == until_tick:
-                return self._observe(stage, now)
-            frame, command = None, command if verdict.reset is None else STILL
+            if verdict.reset is not None:
+                self._commands.put_back()
+            asks = self.clock.acts(now.tick) and now.tick >= free_again
+            if self.over or asks or now.tick == until_tick:
+                return self._observe(stage, now, asks)
+            frame = None
 
     def result(self) -> tuple[Record, Log]:
         """What came out: the record and the log. Raises UsageError while the episode goes on."""
         if not self.over:
             raise UsageError("this Episode is not over: advance() it until `over`, then ask for its result()")
         if self._result is None:
-            record, log = self._scorer.result(self.record)
+            record, log = self._scorer.result(self.record, self._commands.answers)
             clock = {"wall_s": time.perf_counter() - self._began_s, "setup_s": self._setup_s}
             self._result = msgspec.structs.replace(record, injections=self._injected.log, clock=clock), log
         return self._result
 
-    def _observe(self, stage: StagedScenario, now: Moment) -> Observation:
-        """What the policy is given now."""
+    def _observe(self, stage: StagedScenario, now: Moment, asks: bool) -> Observation:
+        """What is seen now; asks: by the policy, whose turn it is."""
         was_reset = self._was_reset
-        self._was_reset = was_reset and not self.clock.acts(now.tick)
+        self._was_reset = was_reset and not asks
         time_s, camera = self.clock.time_s(now.tick), stage.parts.camera
         seen, self._frame = stage.observer.observed(now, time_s, camera, was_reset)
+        self._asked_s = time.perf_counter()
         return seen
 
     @property

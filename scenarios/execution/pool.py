@@ -234,7 +234,9 @@ class _Pool:
         """Record a scenario that does not come to its end: no worker survives it, or the policy does not answer."""
         spec = self._folder.spec
         manifest = with_goal(self._hello.manifest, self._options.goal)
-        record = begun(scenario, manifest, spec.suite_hash, self._hello.source_hash, spec.seed)
+        record = begun(
+            scenario, manifest, spec.suite_hash, self._hello.source_hash, spec.seed, spec.latency_ms, spec.real_time
+        )
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.episode.in_flight import median_ms
 from cosim.episode.log import Log
 from cosim.episode.step import Step
 from cosim.judge.event_monitor import EventMonitor, Hidden, why_invalid
@@ -52,9 +54,10 @@ class Scorer:
         self._red_lights += verdict.red_light_entry is not None
         return verdict
 
-    def result(self, begun: Record) -> tuple[Record, Log]:
-        """The record that was begun, with all that came out so far, and the log."""
-        scenario, log, events = self._scenario, self._recorder.log(self._monitor.tracks), self._monitor.outcomes()
+    def result(self, begun: Record, answers: Floats) -> tuple[Record, Log]:
+        """The record that was begun, with all that came out so far, and the log. answers: as in `Log`."""
+        scenario, events = self._scenario, self._monitor.outcomes()
+        log = self._recorder.log(self._monitor.tracks, answers)
         broken = sum(event.rule_met is False for event in events)
         ended, failures = self._verdict.ended, tuple(self._failures)
         into = tuple(self._walked_into)
@@ -69,6 +72,7 @@ class Scorer:
             ticks=len(log),
             state_hash=self._recorder.hash.hexdigest(),
             measures=every_metric(seen),
+            latency_ms=median_ms(answers, self._clock.tick_ms) if begun.real_time else begun.latency_ms,
             failures=failures,
             walked_into=into,
             events=events,

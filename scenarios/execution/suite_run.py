@@ -76,6 +76,7 @@ def run(
         )
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
     options = _settled(options, whole, driver, seed_of_run(options.seed, Path(out) if resume and out else None))
+    check_alone(options, jobs, shared_renderer)
     asks = shared_renderer and check_shared(driver, chosen_camera(options.camera))
     spec = run_spec(whole, picked, name, driver, options, shared_renderer)
     with ExitStack() as stack:
@@ -121,6 +122,8 @@ def run_spec(
         rate_hz=manifest.rate_hz,
         goal_protocol=manifest.goal,
         odometry=manifest.odometry,
+        latency_ms=options.latency_ms,
+        real_time=options.real_time,
         seed=0 if options.seed is None else options.seed,
         scenarios=tuple(s.id for s in picked),
         versions=versions(),
@@ -128,6 +131,26 @@ def run_spec(
         counterfactual=options.counterfactual,
         shared_renderer=shared,
     )
+
+
+def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
+    """Raises UsageError where the answers of a run in real time would wait for those of other episodes."""
+    if options.real_time and (jobs != 1 or shared):
+        much = "a shared renderer" if shared else f"{jobs} jobs"
+        raise UsageError(f"in real time every answer is timed, and {much} would be timed too: take one job, without it")
+
+
+def measured_latency_ms(whole: Suite, first: Scenario, policy: str, options: EpisodeOptions) -> float:
+    """The latency that a policy shows on this machine: the median over an episode in real time, in a process of its
+    own. Raises UsageError when that does not come to its end."""
+    alone = EpisodeOptions(
+        seed=options.seed, robot=options.robot, goal=options.goal, own_camera=options.own_camera, camera=options.camera,
+        real_time=True,
+    )  # fmt: skip
+    row = run(whole, policy, scenarios=[first.id], options=alone).iloc[0]
+    if row["status"] == "crashed":
+        raise UsageError(f"the latency of '{policy}' cannot be measured in {first.id}: it crashed: {row['reason']}")
+    return float(row["latency_ms"])
 
 
 def seed_of_run(asked: int | None, resumed: Path | None) -> int:

@@ -1,0 +1,199 @@
+"""Latency: commands that take effect later than what they answer, given, and as measured in real time."""
+
+from __future__ import annotations
+
+import re
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.cli.latency import with_latency
+from cosim.cli.tables import print_terms
+from cosim.core.errors import UsageError
+from cosim.core.geometry import Floats
+from cosim.core.state import STILL, Command
+from cosim.episode.in_flight import InFlight
+from cosim.episode.log import Log
+from cosim.episode.ports import Manifest, Observation
+from cosim.records.record import Record, begun
+from cosim.records.results import table_of
+from cosim.records.run_folder import read_records, read_spec
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import Scenario, Suite, write_suite
+from scenarios.catalog import load_suite
+from scenarios.checks import small_scenario
+from scenarios.execution.replay import Recorded, replayed
+from scenarios.execution.run import run_episode
+from scenarios.execution.suite_run import check_alone
+from tests.conftest import Cosim
+from tests.records.test_tables import terminal
+
+
+def commands(answers: Floats, ticks: int) -> Floats:
+    """(ticks, 2) what the answers of an episode without a reset are as commands, tick by tick."""
+    held = np.zeros((ticks, 2))
+    for tick, delay, v_mps, w_radps in answers:
+        held[int(tick + delay) :] = v_mps, w_radps
+    return held
+
+
+def test_commands_take_effect_in_their_order_and_are_lost_where_the_robot_is_put_elsewhere() -> None:
+    """By hand: asked at 0, 5, 10 with 7 ticks of delay; that of 10 is on its way when the robot is put back."""
+    way, told = InFlight(), [Command(float(v), 0.0) for v in (1, 2, 3)]
+    way.answered(0, 7, told[0])
+    assert [way.at(tick) for tick in (0, 4)] == [STILL, STILL]
+    way.answered(5, 7, told[1])
+    assert [way.at(tick) for tick in (6, 7, 9)] == [STILL, told[0], told[0]]
+    way.answered(10, 7, told[2])
+    assert [way.at(tick) for tick in (11, 12)] == [told[0], told[1]]
+    way.put_back()
+    assert (way.at(13), way.at(17)) == (STILL, STILL)
+    assert way.answers.tolist() == [[0, 7, 1, 0], [5, 7, 2, 0], [10, 7, 3, 0]]
+    way.answered(20, 0, told[0])
+    assert way.at(20) == told[0]
+
+
+@pytest.mark.parametrize("latency_ms", [-1.0, float("nan"), 10_001.0], ids=["negative", "no number", "too much"])
+def test_a_latency_that_there_is_not_is_refused(latency_ms: float) -> None:
+    """In words that give the range."""
+    with pytest.raises(UsageError, match=r"latency_ms must be from 0 to 10000 ms, not"):
+        EpisodeOptions(latency_ms=latency_ms)
+
+
+def test_real_time_goes_with_one_process_and_no_latency() -> None:
+    """Who would time the others too is refused, and who asks for both."""
+    with pytest.raises(UsageError, match="leave latency_ms out"):
+        EpisodeOptions(latency_ms=50.0, real_time=True)
+    for jobs, shared, named in ((2, False, "2 jobs"), (1, True, "a shared renderer")):
+        check_alone(EpisodeOptions(), jobs, shared)
+        with pytest.raises(UsageError, match=f"{named} would be timed too: take one job"):
+            check_alone(EpisodeOptions(real_time=True), jobs, shared)
+
+
+def test_tables_tell_of_latency_where_there_is_any() -> None:
+    """A given one as a number, a measured one with its range and what it is not; of none nothing."""
+
+    def told(*records: Record) -> str:
+        out, said = terminal()
+        print_terms(out, table_of(records))
+        return " ".join(said.getvalue().split())
+
+    none = begun(load_suite("reactive").scenarios[0], Manifest("m", camera=None), "h")
+    given = msgspec.structs.replace(none, latency_ms=200.0)
+    real = [msgspec.structs.replace(none, latency_ms=ms, real_time=True) for ms in (100.0, 150.0, 400.0)]
+    assert "latency" not in told(none)
+    assert "latency 200 ms: commands take effect so much later" in told(given)
+    assert "in real time: latency of an episode's answers 150 ms (100 to 400 ms)" in told(*real)
+    assert "not to be had again from the seed" in told(*real)
+
+
+@pytest.mark.parametrize(
+    "asked, real_time, told",
+    [
+        ("soon", False, "--latency 'soon': give milliseconds, like 200, or 'measured'"),
+        ("200", True, "--real-time measures the latency of every answer: leave --latency out"),
+        ("-1", False, "latency_ms must be from 0 to 10000 ms, not -1"),
+    ],
+    ids=["a word", "both", "negative"],
+)
+def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, told: str) -> None:
+    """By name, with the remedy."""
+    whole = load_suite("reactive")
+    with pytest.raises(UsageError, match=re.escape(told)):
+        with_latency(EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop")
+
+
+def small_in_two_s() -> Scenario:
+    """Two seconds of a long way in a small city."""
+    return msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
+
+
+SLOW_ONE = """
+import time
+
+from cosim import Command, Manifest
+
+
+class Slow:
+    manifest = Manifest("slow", rate_hz=4.0, camera=None)
+
+    def reset(self, episode_id, seed): ...
+
+    def act(self, observation):
+        time.sleep(0.12)
+        return Command(0.5, 0.0)
+"""
+
+
+class Faster:
+    """Blind, 5 Hz; at each observation it wants to be a tenth of a metre a second faster. It is slow to answer."""
+
+    manifest = Manifest("faster", rate_hz=5.0, camera=None)
+
+    def __init__(self, slow_s: float = 0.0) -> None:
+        self.asked: list[int] = []
+        self._slow_s = slow_s
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Begin slowly."""
+        self.asked = []
+
+    def act(self, observation: Observation) -> Command:
+        self.asked.append(observation.tick)
+        time.sleep(self._slow_s)
+        return Command(0.1 * len(self.asked), 0.0)
+
+
+@pytest.fixture(scope="module")
+def scenario() -> Scenario:
+    return small_in_two_s()
+
+
+@pytest.mark.engine
+def test_with_latency_each_command_takes_effect_so_much_later_to_the_tick(scenario: Scenario) -> None:
+    """By hand: 120 ms are three ticks, so that of observations every 4 ticks the commands begin at 3, 7, 11, ..."""
+    came = run_episode(scenario, Faster(), EpisodeOptions(latency_ms=120.0))
+    assert came.log is not None and (came.record.latency_ms, came.record.real_time) == (120.0, False)
+    by_hand = [0.0] * 3 + [0.1 * k for k in range(1, 10) for _ in range(4)] + [0.1 * 10]
+    assert np.allclose(came.log.command[:, 0], by_hand, atol=1e-12)
+    assert came.log.answers[:, :2].tolist() == [[4 * k, 3] for k in range(10)]
+
+
+@pytest.mark.engine
+def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(scenario: Scenario) -> None:
+    """A policy that takes 0.2 s: the recorded delays are what was applied, it is not asked before it has answered, and
+    the replay of the record has the same state hash."""
+    slow = Faster(slow_s=0.2)
+    came = run_episode(scenario, slow, EpisodeOptions(real_time=True))
+    record, log = came.record, came.log
+    assert log is not None and record.real_time
+    asked, delays = log.answers[:, 0], log.answers[:, 1]
+    assert (delays >= 4).all() and asked.tolist() == slow.asked and (asked[1:] >= (asked + delays)[:-1]).all()
+    assert np.array_equal(log.command, commands(log.answers, len(log)))
+    assert record.latency_ms == 50.0 * np.median(delays)
+    assert replayed(Recorded(scenario, record, log)) == record.state_hash
+
+
+@pytest.mark.engine
+def test_a_measured_latency_is_that_of_every_command_of_the_run(
+    scenario: Scenario, tmp_path: Path, cosim: Cosim
+) -> None:
+    """Not less than what the policy sleeps, and fixed: the row tells it, `--resume` keeps it and refuses another."""
+    (tmp_path / "slow_one.py").write_text(SLOW_ONE)
+    short = msgspec.structs.replace(scenario, time_limit_s=1.0)
+    write_suite(Suite(name="brief", version="1", scenarios=(short,)), tmp_path / "brief.json")
+    words = ("run", "brief.json", "--policy", "slow_one:Slow", "--out", "mine")
+    said = cosim(*words, "--latency", "measured", cwd=tmp_path)
+    assert said.returncode == 0, said.stderr
+    latency_ms = read_spec(tmp_path / "mine").latency_ms
+    (record,) = read_records(tmp_path / "mine")
+    assert latency_ms == record.latency_ms >= 150.0 and not record.real_time
+    assert f"latency {latency_ms:g} ms: commands take effect" in said.stdout
+    log = Log.load(tmp_path / "mine" / "episodes" / short.id / "trajectory.npz")
+    assert (log.answers[:, 1] * 50.0 == latency_ms).all()
+    assert cosim(*words, "--latency", "measured", "--resume", cwd=tmp_path).returncode == 0
+    other = cosim(*words, "--resume", cwd=tmp_path)
+    assert other.returncode == 2 and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
