@@ -24,6 +24,7 @@ from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, lis
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
 from cosim.cli.progress import doing
+from cosim.cli.score import score
 from cosim.cli.suite import suite_app
 from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError, unknown
 
@@ -45,6 +46,7 @@ SEED_HELP = (
 OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
 GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
+TRUST = "Trust what came out"
 
 
 def say_versions(asked: bool) -> None:
@@ -368,6 +370,7 @@ app.command(
     "`cosim bench camera`  \n`cosim bench crowd --cities 10`  \n"
     "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
 )(bench)
+app.command(rich_help_panel=TRUST, epilog="Example:  \n`cosim score runs/mine`")(score)
 app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)

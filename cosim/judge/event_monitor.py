@@ -24,7 +24,7 @@ from cosim.core.geometry import Floats, Pose
 from cosim.core.state import PersonKind, RobotState
 from cosim.episode.ports import CameraSpec
 from cosim.episode.step import Step
-from cosim.records.record import TriggeredEvent
+from cosim.records.record import Record, TriggeredEvent
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.events import Event, EventState
 from cosim.spec.robot import Mount, Robot
@@ -164,7 +164,19 @@ def _side(a: Floats, b: Floats, p: Floats) -> float:
     return float((b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]))
 
 
-def why_invalid(event: Event, outcome: TriggeredEvent) -> str:
+def why_invalid(record: Record, scenario: Scenario) -> str:
+    """Why an episode that is about its event says nothing about the robot that came by; "" if it does. Whoever fails
+    before it comes by has failed.
+
+    A long way has events that a robot may fail to come to; there this makes nothing invalid.
+    """
+    if not scenario.ends_on_failure or record.failures or record.ended not in ("goal", "stop"):
+        return ""
+    reasons = [why_unseen(event, outcome) for event, outcome in zip(scenario.events, record.events, strict=True)]
+    return "; ".join(filter(None, reasons))
+
+
+def why_unseen(event: Event, outcome: TriggeredEvent) -> str:
     """Why an event says nothing about the robot that came by, in words; "" if it does."""
     if outcome.triggered_at_s is None:
         return f"event {event.id} ({event.kind}) never triggered"

@@ -12,13 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.episode.log import Log
 from cosim.judge.referee import Failure
-from cosim.records.record import Ended
-
-SCHEMA = 3
-"""Raised whenever a definition changes; results of different schemas are not compared."""
+from cosim.records.record import Ended, Record
+from cosim.spec.scenario import Scenario
 
 STALLED_MPS = 0.05
 _PERSONAL_SPACE_M = 1.2
@@ -43,6 +42,21 @@ class EpisodeFacts:
     rules_broken: int = 0
     walked_into: tuple[Failure, ...] = ()
     period_ticks: int = 5
+
+    @classmethod
+    def of(cls, record: Record, scenario: Scenario, log: Log) -> EpisodeFacts:
+        """Those of an episode that was recorded: all that a metric sees stands in its files."""
+        clock = Clock.for_rate(record.rate_hz)
+        return cls(
+            log=log,
+            failures=record.failures,
+            red_light_entries=len(record.red_light_entries),
+            ended=record.ended,
+            route_length_m=scenario.route_line.length_m,
+            rules_broken=sum(event.rule_met is False for event in record.events),
+            walked_into=record.walked_into,
+            period_ticks=clock.policy_ms // clock.tick_ms,
+        )
 
 
 class Metric(NamedTuple):

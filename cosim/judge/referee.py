@@ -31,6 +31,7 @@ from typing import Literal
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overlap
@@ -110,7 +111,7 @@ class Referee:
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
         self._still_ticks = 0
-        self._window: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
+        self._window = FreezeWindow(clock)
         self._failed_at_s: list[float] = []
         self._entered: set[str] = set()
         self._stood_ticks = 0
@@ -138,9 +139,8 @@ class Referee:
     def _end(self, step: Step) -> Literal["goal", "stop", "timeout", "failure"] | None:
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
-        pose, goal = step.motion.robot.pose, self._scenario.goal
-        near = np.hypot(pose.x_m - goal[0], pose.y_m - goal[1]) <= self._scenario.goal_radius_m
-        if near and step.route_s_after_m >= self._route.length_m - 2 * self._scenario.goal_radius_m:
+        pose = step.motion.robot.pose
+        if at_goal(self._scenario, np.array([pose]), np.array([step.route_s_after_m])).any():
             return "goal"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
 
@@ -202,16 +202,8 @@ class Referee:
     def _freezing(self, step: Step, waits_at_red: bool) -> tuple[Failure, ...]:
         if waits_at_red or self._scenario.ends_on_failure:
             return ()
-        self._window.append(step.motion.robot.pose[:2])
-        if len(self._window) < (self._window.maxlen or 0):
-            return ()
-        # Mostly it is far from where it was, whatever lies between.
-        if math.dist(self._window[0], self._window[-1]) > FREEZE_MOVE_M + _ROUNDING_M:
-            return ()
-        track = np.array(self._window)
-        if np.hypot(*(track - track[0]).T).max() >= FREEZE_MOVE_M:
-            return ()
-        return (self._failure("freezing", step),)
+        x_m, y_m, _ = step.motion.robot.pose
+        return (self._failure("freezing", step),) if self._window.frozen((x_m, y_m)) else ()
 
     def _waits_at_red(self, step: Step) -> bool:
         return any(
@@ -277,6 +269,36 @@ class Referee:
         if len(people) and np.hypot(*(people.xy - pose.xy).T).min() < FREE_OF_PEOPLE_M:
             return False
         return not (len(vehicles) and np.hypot(*(vehicles.xy - pose.xy).T).min() < FREE_OF_VEHICLES_M)
+
+
+class FreezeWindow:
+    """Where a robot was within the last 10 s, those left out in which it waited lawfully."""
+
+    def __init__(self, clock: Clock) -> None:
+        self._at: deque[tuple[float, float]] = deque(maxlen=clock.ticks(FREEZE_WINDOW_S) + 1)
+
+    def frozen(self, xy: tuple[float, float]) -> bool:
+        """Whether it is frozen now that it is here after a further tick, metres."""
+        self._at.append(xy)
+        if len(self._at) < (self._at.maxlen or 0):
+            return False
+        # Mostly it is far from where it was, whatever lies between.
+        if math.dist(self._at[0], xy) > FREEZE_MOVE_M + _ROUNDING_M:
+            return False
+        track = np.array(self._at)
+        return bool(np.hypot(*(track - track[0]).T).max() < FREEZE_MOVE_M)
+
+    def clear(self) -> None:
+        """It was put elsewhere."""
+        self._at.clear()
+
+
+def at_goal(scenario: Scenario, pose: Floats, route_s_m: Floats) -> NDArray[np.bool_]:
+    """(T,) at which of (T, 3) poses with these arc lengths (T,) the goal is reached."""
+    away_m = np.hypot(pose[:, 0] - scenario.goal[0], pose[:, 1] - scenario.goal[1])
+    last_m = scenario.route_line.length_m - 2 * scenario.goal_radius_m
+    reached: NDArray[np.bool_] = (away_m <= scenario.goal_radius_m) & (route_s_m >= last_m)
+    return reached
 
 
 def stands_before(robot: Pose, event: Event, state: EventState) -> bool:

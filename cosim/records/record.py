@@ -31,6 +31,8 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
+METRIC_SCHEMA = 3
+"""Raised whenever a definition of `cosim.judge.metrics` changes; measures of different schemas are not compared."""
 NO_RENDERER = "none"
 """The renderer of an episode whose policy has no camera."""
 
@@ -53,6 +55,13 @@ class TriggeredEvent(msgspec.Struct, frozen=True, kw_only=True):
     rule_met: bool | None = None
 
 
+class RedLightEntry(msgspec.Struct, frozen=True):
+    """The robot entered a crossing of its route whose signal said stop."""
+
+    tick: int
+    crossing: str
+
+
 class Record(msgspec.Struct, frozen=True, kw_only=True):
     """What came out of one episode. reason: why it crashed or is invalid. clock: wall times, not reproducible.
 
@@ -63,6 +72,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     walked_into: contacts with people who walked into the robot where it stood; no failures.
     waypoints: how those that it answers were followed. latency_ms: of its commands, as asked for; in real_time the
     median of those that were measured, and another one the next time: such a record is replayed, not made again.
+    metric_schema: METRIC_SCHEMA of the version that made the measures, 0 where that did not say.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     crashed: its policy crashed, which counts as a failure. invalid: what the simulator owes, counted apart: it came to
     its end without a failure, and its event had not happened or could not be seen; or an engine failed, twice. ended:
@@ -109,8 +119,10 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     measures: dict[str, float | None] = {}
     failures: tuple[Failure, ...] = ()
     walked_into: tuple[Failure, ...] = ()
+    red_light_entries: tuple[RedLightEntry, ...] = ()
     events: tuple[TriggeredEvent, ...] = ()
     injections: tuple[Injected, ...] = ()
+    metric_schema: int = 0
     schema: int = _SCHEMA
     clock: dict[str, float] = {}
 
@@ -175,6 +187,7 @@ def begun(
         renderer=NO_RENDERER,
         versions=versions(),
         status="crashed",
+        metric_schema=METRIC_SCHEMA,
     )
 
 

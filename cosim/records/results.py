@@ -10,8 +10,7 @@ import numpy as np
 import pandas as pd
 
 from cosim.core.geometry import Floats
-from cosim.judge import metrics
-from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
+from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED, RATE_NEEDS_M
 from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
@@ -39,7 +38,7 @@ def table_row(record: Record) -> dict[str, Any]:
     row["waypoints"] = record.waypoints.in_words
     further = [f"{name}: {spec.in_words}" for name, spec in record.cameras.items()]
     row["camera"] = "none" if record.camera is None else "; ".join([record.camera.in_words, *further])
-    row["metric_schema"] = metrics.SCHEMA
+    row["metric_schema"] = record.metric_schema
     row["versions"] = msgspec.json.encode(record.versions, order="deterministic").decode()
     counted: dict[str, Mapping[str, float | None]] = {"done": record.measures, "crashed": WORST, "invalid": {}}
     measures = counted[record.status]
@@ -73,7 +72,7 @@ def _summary(table: pd.DataFrame, name: str) -> tuple[float, float, float, int]:
         return (float(values.mean()) if len(values) else np.nan, *interval_of(values), len(values))
     counted, metres = (_numbers(table, column) for column in POOLED[name])
     known = ~(np.isnan(counted) | np.isnan(metres))
-    if (table["status"] == "crashed").any() or metres[known].sum() < metrics.RATE_NEEDS_M:
+    if (table["status"] == "crashed").any() or metres[known].sum() < RATE_NEEDS_M:
         return np.nan, np.nan, np.nan, 0
     counted, metres = counted[known], metres[known]
     return 100.0 * counted.sum() / metres.sum(), *interval_of(100.0 * counted, metres), len(counted)

@@ -20,7 +20,7 @@ from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 import pandas as pd
@@ -45,7 +45,7 @@ UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
     "versions", "renderer", "counterfactual", "waypoints", "seed",
-    "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time",
+    "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time", "metric_schema",
 )  # fmt: skip
 """What makes two runs the same."""
 
@@ -79,6 +79,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     renderer: str = "unknown"
     counterfactual: bool = False
     shared_renderer: bool = False
+    metric_schema: int = 0
     schema: int = 1
 
 
@@ -284,6 +285,32 @@ def read_records(path: Path) -> list[Record]:
         raise _trouble(path, error) from error
 
 
+def read_rows(path: Path) -> dict[str, dict[str, Any]]:
+    """The row of each scenario as `results.sqlite` has it. Raises RunError."""
+    try:
+        with closing(_connect(path)) as database:
+            rows = database.execute("select scenario, row from episodes").fetchall()
+        return {scenario: json.loads(row) for scenario, row in rows}
+    except json.JSONDecodeError as error:
+        raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
+    except sqlite3.Error as error:
+        raise _trouble(path, error) from error
+
+
+def refuse_in_use(path: Path) -> None:
+    """Raises RunError, naming the process, while a run is writing to its folder."""
+    try:
+        lock = os.open(path / "lock", os.O_RDONLY)
+    except FileNotFoundError:
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise _in_use(path, lock) from None
+    finally:
+        os.close(lock)
+
+
 def _refuse_used(path: Path) -> None:
     """Raises RunError when a folder holds a run, or something else that is not a run's beginning."""
     if (path / "run.json").exists():
@@ -300,16 +327,21 @@ def _locked(path: Path) -> int:
         os.ftruncate(lock, 0)
         os.pwrite(lock, str(os.getpid()).encode(), 0)
     except BlockingIOError:
-        holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "?"
+        refusal = _in_use(path, lock)
         os.close(lock)
-        raise RunError(
-            f"{path} is in use by process {holder}: another cosim run is writing to it. "
-            "Wait for it to end, or choose another --out."
-        ) from None
+        raise refusal from None
     except OSError:
         os.close(lock)
         raise
     return lock
+
+
+def _in_use(path: Path, lock: int) -> RunError:
+    holder = os.pread(lock, 32, 0).decode(errors="replace").strip() or "?"
+    return RunError(
+        f"{path} is in use by process {holder}: another cosim run is writing to it. "
+        "Wait for it to end, or choose another --out."
+    )
 
 
 def _connect(path: Path) -> sqlite3.Connection:

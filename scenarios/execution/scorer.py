@@ -14,7 +14,7 @@ from cosim.judge.metrics import EpisodeFacts, every_metric
 from cosim.judge.referee import Failure, Referee, Verdict
 from cosim.judge.traffic import TrafficMonitor
 from cosim.place.street_map import StreetMap, WalkableArea
-from cosim.records.record import Record, Recorder, TriggeredEvent
+from cosim.records.record import Record, Recorder, RedLightEntry, Status
 from cosim.spec.event_kind import EventKinds
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
@@ -41,7 +41,7 @@ class Scorer:
         self._traffic = TrafficMonitor(street_map, clock.tick_s)
         self._failures: list[Failure] = []
         self._walked_into: list[Failure] = []
-        self._red_lights = 0
+        self._red_lights: list[RedLightEntry] = []
         self._verdict = Verdict()
 
     def score(self, step: Step) -> Verdict:
@@ -51,42 +51,25 @@ class Scorer:
         self._monitor.see(step)
         self._failures += verdict.failures
         self._walked_into += verdict.walked_into
-        self._red_lights += verdict.red_light_entry is not None
+        if verdict.red_light_entry is not None:
+            self._red_lights.append(RedLightEntry(step.tick, verdict.red_light_entry))
         return verdict
 
     def result(self, begun: Record, answers: Floats) -> tuple[Record, Log]:
         """The record that was begun, with all that came out so far, and the log. answers: as in `Log`."""
         scenario, events = self._scenario, self._monitor.outcomes()
         log = self._recorder.log(self._monitor.tracks, answers)
-        broken = sum(event.rule_met is False for event in events)
-        ended, failures = self._verdict.ended, tuple(self._failures)
-        into = tuple(self._walked_into)
-        length_m, period = scenario.route_line.length_m, self._clock.policy_ms // self._clock.tick_ms
-        seen = EpisodeFacts(log, failures, self._red_lights, ended, length_m, broken, into, period)
-        reason = "" if failures or ended not in ("goal", "stop") else unseen(scenario, events)
         record = msgspec.structs.replace(
             begun,
-            status="invalid" if reason else "done",
-            reason=reason,
-            ended=ended,
+            ended=self._verdict.ended,
             ticks=len(log),
             state_hash=self._recorder.hash.hexdigest(),
-            measures=every_metric(seen),
             latency_ms=median_ms(answers, self._clock.tick_ms) if begun.real_time else begun.latency_ms,
-            failures=failures,
-            walked_into=into,
+            failures=tuple(self._failures),
+            walked_into=tuple(self._walked_into),
+            red_light_entries=tuple(self._red_lights),
             events=events,
         )
-        return record, log
-
-
-def unseen(scenario: Scenario, events: tuple[TriggeredEvent, ...]) -> str:
-    """Why an episode that is about its event says nothing about the robot that came by; "" if it does. Whoever fails
-    before it comes by has failed.
-
-    A long way has events that a robot may fail to come to; there this makes nothing invalid.
-    """
-    if not scenario.ends_on_failure:
-        return ""
-    reasons = [why_invalid(event, outcome) for event, outcome in zip(scenario.events, events, strict=True)]
-    return "; ".join(filter(None, reasons))
+        measures, reason = every_metric(EpisodeFacts.of(record, scenario, log)), why_invalid(record, scenario)
+        status: Status = "invalid" if reason else "done"
+        return msgspec.structs.replace(record, status=status, reason=reason, measures=measures), log

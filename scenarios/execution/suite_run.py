@@ -17,7 +17,7 @@ from cosim.episode.driver import Driver
 from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
-from cosim.records.record import NO_RENDERER
+from cosim.records.record import METRIC_SCHEMA, NO_RENDERER
 from cosim.records.run_folder import RunFolder, RunSpec, read_spec
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.pseudonym import drawn_seed
@@ -111,6 +111,7 @@ def run_spec(
         suite=whole.name,
         robots={robot.name: hash_of_robot(robot) for robot in robots},
         suite_version=whole.version,
+        metric_schema=METRIC_SCHEMA,
         suite_hash=whole.content_hash,
         policy=policy,
         policy_name=manifest.name,

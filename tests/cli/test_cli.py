@@ -162,7 +162,7 @@ def unbroken(desk: Path, cosim: Cosim) -> bytes:
 
 
 def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, whole_run: Path) -> None:
-    """Rows, records, trajectories and specs are there, and `show` prints the same table again."""
+    """Rows, records, trajectories and specs are there; `show` prints the table again, `score` computes it again."""
     table = rows(whole_run)
     assert list(table.index) == ["t-0", "t-1", "t-2"]
     assert set(table["status"]) == {"done"}
@@ -173,6 +173,8 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, 
     assert (
         shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, scored 3, of these crashed 0" in shown.stdout
     )
+    again = cosim("score", "whole", cwd=desk)
+    assert again.returncode == 0 and "3 episodes" in again.stdout and "equal to the bit" in again.stdout
     one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)
     assert one.returncode == 0, one.stderr
     assert (desk / "above.png").stat().st_size > 5000

@@ -9,7 +9,7 @@ import pytest
 
 from cosim.core.geometry import Pose
 from cosim.core.state import RobotState
-from cosim.judge.event_monitor import STANDARD_CAMERA, body_points, eye_of, in_picture, went_between, why_invalid
+from cosim.judge.event_monitor import STANDARD_CAMERA, body_points, eye_of, in_picture, went_between, why_unseen
 from cosim.records.record import TriggeredEvent
 from cosim.spec.events import Event
 from cosim.spec.robot import COURIER
@@ -68,7 +68,7 @@ def test_an_event_that_nobody_saw_is_told_in_words() -> None:
     """Never triggered, never in view, or a proper event."""
     event = Event(id="e0", kind="frontal", x_m=0.0, y_m=0.0, heading_rad=0.0, route_s_m=5.0, half_width_m=1.5)
     outcome = TriggeredEvent(id="e0", kind="frontal", passed=False)
-    assert why_invalid(event, outcome) == "event e0 (frontal) never triggered"
+    assert why_unseen(event, outcome) == "event e0 (frontal) never triggered"
     blind = TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0)
-    assert why_invalid(event, blind) == "nobody of event e0 (frontal) could be seen"
-    assert why_invalid(event, TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0, seen=True)) == ""
+    assert why_unseen(event, blind) == "nobody of event e0 (frontal) could be seen"
+    assert why_unseen(event, TriggeredEvent(id="e0", kind="frontal", passed=True, triggered_at_s=1.0, seen=True)) == ""

@@ -99,6 +99,8 @@ def test_a_run_says_whom_its_robot_delayed_only_when_asked(scenario: Scenario, t
     done = cosim("run", "one.json", "--policy", "orca", "--out", "asked", "--counterfactual", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "against the same street without the robot" in done.stdout
+    scored = cosim("score", "asked", cwd=tmp_path)
+    assert scored.returncode == 0 and "no trajectory tells people_delay_s, people_compared," in scored.stdout
     row = pd.read_csv(tmp_path / "asked" / "results.csv").iloc[0]
     plain = run_episode(short, load_policy("orca"), EpisodeOptions(suite_hash=str(row["suite_hash"]))).record
     asked = Record.load(tmp_path / "asked" / "episodes" / scenario.id / "record.json")

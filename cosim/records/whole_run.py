@@ -1,0 +1,95 @@
+"""WholeRun: a run that has ended, read with care: what in its folder does not belong together is refused, by name."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+
+from cosim.core.errors import RunError
+from cosim.records.record import METRIC_SCHEMA, Record
+from cosim.records.run_folder import DATABASE, RunSpec, read_records, read_spec, refuse_in_use
+from cosim.spec.ranges import shown
+from cosim.spec.scenario import Scenario, content_hash, read_suite
+
+_UNTOLD = "an earlier version, which did not tell its metric schema"
+
+
+class WholeRun(NamedTuple):
+    """scenarios: that were to be run; records: of those that have ended. Both by scenario id."""
+
+    path: Path
+    spec: RunSpec
+    scenarios: Mapping[str, Scenario]
+    records: Mapping[str, Record]
+
+
+def read_whole_run(path: Path) -> WholeRun:
+    """The run in a folder.
+
+    Raises UsageError where there is none; RunError, naming file and remedy, while it is going on, before an episode has
+    ended, for a record that is truncated or not what `results.sqlite` has, for scenarios that were edited since, and
+    for measures of another metric schema; SpecError for a damaged `scenarios.json`.
+    """
+    spec = read_spec(path)
+    refuse_in_use(path)
+    records = {record.scenario: record for record in sorted(read_records(path), key=lambda r: r.scenario)}
+    if not records:
+        raise RunError(f"{path}: no episode of it has ended: give the command of the run again with --resume")
+    scenarios = {scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios}
+    for name, record in records.items():
+        _check_schema(path, record)
+        if name not in scenarios or content_hash(scenarios[name]) != record.scenario_hash:
+            raise RunError(
+                f"{path / 'scenarios.json'}: scenario '{name}' is not the one that was run, it was edited since: put "
+                "the file back as it was, or run it again into another --out"
+            )
+        file = record_file(path, name)
+        if file.exists() and (apart := _apart(_read(file), record)):
+            raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
+    return WholeRun(path, spec, scenarios, records)
+
+
+def record_file(path: Path, scenario_id: str) -> Path:
+    """Where the record of an episode is."""
+    return path / "episodes" / scenario_id / "record.json"
+
+
+def anew(file: Path) -> str:
+    """What mends an episode whose file is damaged or missing."""
+    return (
+        f"remove {file.parent} and {file.parents[2] / DATABASE}, and give the command of the run again with --resume, "
+        "which runs this episode anew and keeps the others"
+    )
+
+
+def _read(file: Path) -> Record:
+    try:
+        return Record.load(file)
+    except RunError as error:
+        raise RunError(f"{error}: {anew(file)}") from error
+
+
+def _apart(mine: Record, theirs: Record) -> str:
+    """Where two records of an episode are first apart, in words; "" where they are not."""
+    told, other = (msgspec.to_builtins(record) for record in (mine, theirs))
+    for field, value in told.items():
+        if isinstance(value, dict):
+            for name in dict.fromkeys([*value, *other[field]]):
+                if value.get(name) != other[field].get(name):
+                    return f"{field}.{name} is {value.get(name)}, there {other[field].get(name)}"
+        elif value != other[field]:
+            return f"{field} is {shown(value)}, there {shown(other[field])}"
+    return ""
+
+
+def _check_schema(path: Path, record: Record) -> None:
+    """Raises RunError where measures are not by the definitions of this version."""
+    if record.metric_schema != METRIC_SCHEMA:
+        made = f"metric schema {record.metric_schema}" if record.metric_schema else _UNTOLD
+        raise RunError(
+            f"{path}: the measures of '{record.scenario}' are of {made}; this version has {METRIC_SCHEMA}, and other "
+            "definitions are not compared: run it again with this version"
+        )
