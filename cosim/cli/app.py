@@ -24,6 +24,7 @@ from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, lis
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
 from cosim.cli.progress import doing
+from cosim.cli.scenario import scenario_app
 from cosim.cli.score import score
 from cosim.cli.suite import suite_app
 from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError, unknown
@@ -372,6 +373,7 @@ app.command(
 )(bench)
 app.command(rich_help_panel=TRUST, epilog="Example:  \n`cosim score runs/mine`")(score)
 app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
+app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 

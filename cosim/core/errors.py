@@ -32,6 +32,10 @@ MOST_LISTED = 30
 """Of more valid choices than these, five are listed: those most like what was asked for, else the first."""
 
 
+_MOST_LETTERS = 100
+"""Of a name that is compared with valid ones."""
+
+
 class CosimError(Exception):
     """Root of every error this project raises on purpose. The message says what to do.
 
@@ -108,9 +112,14 @@ def unwritable(path: Path, error: OSError, remedy: str = "choose another place, 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
     """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x", ["unit"])."""
     valid = sorted(choices)
-    near = get_close_matches(name, valid, n=5, cutoff=0.5)
     listed = ", ".join(valid) or "none"
     if len(valid) > MOST_LISTED:
+        near = get_close_matches(name, valid, n=5, cutoff=0.5)
         listed = f"{len(valid)}, among them {', '.join(sorted(near) or valid[:5])}"
-    meant = f" Did you mean {near[0]}?" if near else ""
-    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed}.{meant}")
+    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed}.{nearest(name, valid)}")
+
+
+def nearest(name: str, valid: Iterable[str]) -> str:
+    """The question whether the valid name most like this one was meant; "" where none is like it."""
+    near = get_close_matches(name[:_MOST_LETTERS], sorted(valid), n=1, cutoff=0.5)
+    return f" Did you mean {near[0]}?" if near else ""

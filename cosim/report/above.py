@@ -122,29 +122,39 @@ def draw_above(street_map: StreetMap, scenario: Scenario, record: Record, log: L
     bounds = (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
     sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1])))
     draw_streets(sheet, street_map, shapely.box(*bounds))
-    sheet.line(route, ROUTE, 0.4)
-    for barrier in scenario.barriers:
-        across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
-        middle = np.array([barrier.x_m, barrier.y_m])
-        sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
-    for obstacle in scenario.obstacles:
-        sheet.area(footprint(obstacle), OBSTACLE)
+    draw_way_and_things(sheet, scenario)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.CROWD], PERSON, 0.15)
     sheet.dot(log.people_xy[log.people_kind == PersonKind.RESIDENT], RESIDENT, 0.2)
     sheet.dot(log.people_xy[np.isin(log.people_kind, DIRECTED)], EVENT, 0.25)
     draw_track(sheet, log)
-    sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
-    sheet.text(scenario.start[:2], "start", TRACK, END_M)
-    sheet.text(scenario.goal, "goal", TRACK, END_M)
-    for event in scenario.events:
-        sheet.dot(np.array([[event.x_m, event.y_m]]), EVENT, EVENT_RING_M, filled=False)
-        sheet.text((event.x_m, event.y_m), f"{event.id} {event.kind}", EVENT, EVENT_RING_M)
+    draw_ends_and_events(sheet, scenario)
     for failure in record.failures:
         colour = FAILURES[failure.kind]
         sheet.dot(np.array([[failure.x_m, failure.y_m]]), colour, FAILURE_RING_M, filled=False)
         words = f"{failure.kind} {failure.tick * log.tick_s:.0f} s"
         sheet.text((failure.x_m, failure.y_m), words, colour, FAILURE_RING_M)
     return legend(sheet.image, _facts(scenario, record, len(log) * log.tick_s))
+
+
+def draw_way_and_things(sheet: Sheet, scenario: Scenario) -> None:
+    """The way of a scenario, and what stands there."""
+    sheet.line(np.array(scenario.route), ROUTE, 0.4)
+    for barrier in scenario.barriers:
+        across = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
+        middle = np.array([barrier.x_m, barrier.y_m])
+        sheet.line(np.array([middle - across, middle + across]), BARRIER, 0.5)
+    for obstacle in scenario.obstacles:
+        sheet.area(footprint(obstacle), OBSTACLE)
+
+
+def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
+    """Start, goal and events of a scenario, by name."""
+    sheet.dot(np.array([scenario.start[:2], scenario.goal]), TRACK, END_M)
+    sheet.text(scenario.start[:2], "start", TRACK, END_M)
+    sheet.text(scenario.goal, "goal", TRACK, END_M)
+    for event in scenario.events:
+        sheet.dot(np.array([[event.x_m, event.y_m]]), EVENT, EVENT_RING_M, filled=False)
+        sheet.text((event.x_m, event.y_m), f"{event.id} {event.kind}", EVENT, EVENT_RING_M)
 
 
 def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:

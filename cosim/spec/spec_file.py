@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from itertools import islice
 from pathlib import Path
-from types import UnionType
+from types import NoneType, UnionType
 from typing import Annotated, Any, Final, Literal, TypeVar, Union, get_args, get_origin
 
 import msgspec
 
-from cosim.core.errors import SpecError
+from cosim.core.errors import SpecError, nearest
 from cosim.spec.ranges import MOST_SHOWN, Ranged, printable, refusal_of, rules_of, shown
 
 MOST_BYTES: Final = 1_000_000_000
@@ -47,13 +47,13 @@ def read_spec_file(path: Path, kind: type[Spec]) -> Spec:
         raise SpecError(f"{path}: {in_lines(faults)}") from error
 
 
-def in_lines(faults: Sequence[str]) -> str:
-    """A fault as it is; of several, their number and the first MOST_TOLD of them, a line each."""
+def in_lines(faults: Sequence[str], most: int = MOST_TOLD) -> str:
+    """A fault as it is; of several, their number and the first `most` of them, a line each."""
     if len(faults) == 1:
         return faults[0]
     count = f"{len(faults)} faults" if len(faults) < MOST_COUNTED else f"{MOST_COUNTED} faults or more"
-    which = f"; the first {MOST_TOLD}" if len(faults) > MOST_TOLD else ""
-    return "\n  ".join([f"{count}{which}:", *faults[:MOST_TOLD]])
+    which = f"; the first {most}" if len(faults) > most else ""
+    return "\n  ".join([f"{count}{which}:", *faults[:most]])
 
 
 def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
@@ -68,7 +68,7 @@ def _faults(data: bytes, kind: Any, error: Exception) -> Iterator[str]:
         yield _malformed(data, error)
         return
     found = False
-    for fault in _faults_in(tree, kind, "$"):
+    for fault in faults_in(tree, kind, "$"):
         found = True
         yield fault
     if not found:
@@ -112,7 +112,7 @@ def _where(data: bytes, byte: int) -> str:
     return f"line {len(lines)}, byte {len(lines[-1])} of it"
 
 
-def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
+def faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
     """Every fault of a value that should be of a type: those of its parts, where they have none its own."""
     try:
         msgspec.convert(tree, kind)
@@ -120,11 +120,11 @@ def _faults_in(tree: Any, kind: Any, place: str) -> Iterator[str]:
     except _REFUSED as error:
         message, whole = str(error), _of_the_whole(error)
     found = False
-    for fault in () if whole else _faults_below(tree, _bare(kind, tree), place):
+    for fault in () if whole else _faults_below(tree, bare_type(kind, tree), place):
         found = True
         yield fault
     if found:
-        yield from _out_of_range(tree, _bare(kind, tree), place)
+        yield from _out_of_range(tree, bare_type(kind, tree), place)
     else:
         if isinstance(tree, str):
             message = message.replace(f"'{tree}'", shown(tree))
@@ -141,10 +141,10 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
     if isinstance(tree, dict) and isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         fields = {field.encode_name: field for field in msgspec.structs.fields(kind)}
         for name in sorted(tree.keys() - fields.keys() - {kind.__struct_config__.tag_field}):
-            yield f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at `{place}`{_listed(fields)}"
+            yield f"Object contains unknown field `{printable(name, MOST_SHOWN)}` - at `{place}`{_listed(fields, name)}"
         for name, field in fields.items():
             if name in tree:
-                yield from _faults_in(tree[name], field.type, f"{place}.{name}")
+                yield from faults_in(tree[name], field.type, f"{place}.{name}")
             elif field.required:
                 yield f"Object missing required field `{name}` - at `{place}`"
     elif isinstance(tree, list) and get_origin(kind) is tuple:
@@ -153,7 +153,7 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
             return
         for number, item in enumerate(tree):
             part = parts[0] if parts[-1] is Ellipsis else parts[number]
-            yield from _faults_in(item, part, f"{place}[{number}]")
+            yield from faults_in(item, part, f"{place}[{number}]")
 
 
 def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
@@ -167,28 +167,36 @@ def _out_of_range(tree: Any, kind: Any, place: str) -> Iterator[str]:
                 yield f"{refusal} - at `{place}`"
 
 
-def _bare(kind: Any, tree: Any) -> Any:
-    """A type without its range; of several kinds of objects the one that the value says it is."""
+def bare_type(kind: Any, tree: Any) -> Any:
+    """A type without its range, and without None; of several kinds of objects the one that the value says it is."""
     if get_origin(kind) is Annotated:
-        return _bare(get_args(kind)[0], tree)
+        return bare_type(get_args(kind)[0], tree)
     if get_origin(kind) in (Union, UnionType):
         for one in get_args(kind):
             config = getattr(one, "__struct_config__", None)
-            if config is not None and isinstance(tree, dict) and tree.get(config.tag_field) == config.tag:
+            if config is None or config.tag is None or not isinstance(tree, dict):
+                continue
+            if tree.get(config.tag_field) == config.tag:
                 return one
+        some = [one for one in get_args(kind) if one is not NoneType]
+        return bare_type(some[0], tree) if len(some) == 1 else kind
     return kind
 
 
 def _choices(kind: Any, tree: Any) -> str:
     """The values that may stand where another does."""
-    bare = _bare(kind, tree)
+    bare = bare_type(kind, tree)
     if get_origin(bare) is Literal:
-        return _listed(get_args(bare))
+        return _listed(get_args(bare), tree)
     if get_origin(bare) in (Union, UnionType):
         tags = [one.__struct_config__.tag for one in get_args(bare) if hasattr(one, "__struct_config__")]
         return _listed(tags)
     return ""
 
 
-def _listed(valid: Any) -> str:
-    return f". Valid choices: {', '.join(map(str, valid))}" if valid else ""
+def _listed(valid: Any, asked: object = None) -> str:
+    if not valid:
+        return ""
+    names = [str(one) for one in valid]
+    meant = nearest(asked, names) if isinstance(asked, str) else ""
+    return f". Valid choices: {', '.join(names)}" + (f".{meant}" if meant else "")

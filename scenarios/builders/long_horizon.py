@@ -72,7 +72,7 @@ class _Draft(NamedTuple):
         return self.robot.width_m / 2 + WAY_SPARE_M
 
 
-_Fences = Callable[[_Draft, Polyline, Sequence[Port]], tuple[Barrier, ...]]
+_Fences = Callable[[StreetMap, Polyline, Sequence[Port], float], tuple[Barrier, ...]]
 
 
 def build_long_horizon(
@@ -132,7 +132,7 @@ def _along(
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
-    barriers = fences(draft, route, way)
+    barriers = fences(street_map, route, way, draft.half_width_m)
     bare = bare_scenario(
         route,
         crossings,
@@ -166,31 +166,33 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
     def draw() -> Scenario:
         if not usable:
             raise SpecError("every long sidewalk is a stair, a bridge, a tunnel or on a road")
-        return _along(draft, rng, search_way(street_map, draft.graph, rng, usable, avoided, draft.length_m), _hemmed)
+        found = search_way(street_map, draft.graph, rng, usable, avoided, draft.length_m)
+        return _along(draft, rng, found, fences_along)
 
     return (draw for _ in range(SEARCHES if usable else 1))
 
 
-def _hemmed(draft: _Draft, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+def fences_along(
+    street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float
+) -> tuple[Barrier, ...]:
     """Barriers at the branches where they do, else all along the way. Raises SpecError when neither leave one path."""
     try:
-        return _barriers(draft, route, way)
+        return _barriers(street_map, route, way, half_width_m)
     except SpecError:
-        fences = hem(draft.street_map, way)
-        prove_single_path(draft.street_map, route, fences, way, draft.half_width_m)
+        fences = hem(street_map, way)
+        prove_single_path(street_map, route, fences, way, half_width_m)
         return fences
 
 
-def _barriers(draft: _Draft, route: Polyline, way: Sequence[Port]) -> tuple[Barrier, ...]:
+def _barriers(street_map: StreetMap, route: Polyline, way: Sequence[Port], half_width_m: float) -> tuple[Barrier, ...]:
     """Barriers that leave one path, square to their strips if possible. Raises SpecError when there are none."""
-    street_map = draft.street_map
     ports, ground = branches(street_map, way), ground_around(street_map, route, way)
     barriers = tuple(barrier_at(street_map, port) for port in ports)
     try:
-        prove_single_path(street_map, route, barriers, way, draft.half_width_m, ground)
+        prove_single_path(street_map, route, barriers, way, half_width_m, ground)
     except SpecError:
         barriers = tuple(barrier_at(street_map, port, slanting=True) for port in ports)
-        prove_single_path(street_map, route, barriers, way, draft.half_width_m, ground)
+        prove_single_path(street_map, route, barriers, way, half_width_m, ground)
     return barriers
 
 

@@ -120,18 +120,19 @@ def obstacles_along(
     per_100m: float | None = None,
     beside: bool = False,
 ) -> tuple[Obstacle, ...]:
-    """Obstacles for a scenario that has route, crossings, barriers and events already; one at least stands in the way
-    if any fits there. per_100m: how many along 100 m of its sidewalks; drawn from PER_100M where None. beside: none in
-    the way, and at least BESIDE_FREE_M from its middle. None where the way itself is no wider than the gap."""
+    """Obstacles for a scenario that has route, crossings, barriers and events already, beside those that it has; one at
+    least stands in the way if any fits there. per_100m: how many along 100 m of its sidewalks; drawn from PER_100M
+    where None. beside: none in the way, and at least BESIDE_FREE_M from its middle. No more than it has where the way
+    itself is no wider than the gap."""
     density = float(rng.uniform(*PER_100M)) if per_100m is None else per_100m
     stretches = _stretches(scenario, street_map, _BEYOND_M if beside else 0.0)
     lengths = np.array([stretch.high_m - stretch.low_m for stretch in stretches])
     room = _Room(scenario, street_map, beside=beside)
-    if not stretches or not room.passable(()):
-        return ()
+    standing = scenario.obstacles
+    if not stretches or not room.passable(standing):
+        return standing
     count = int(density * lengths.sum() / 100.0 + rng.random())
     count = count if beside else max(count, 1)
-    standing: tuple[Obstacle, ...] = ()
     counted = 0
     for draw in range(_DRAWS * count):
         if counted >= count:
@@ -147,13 +148,14 @@ def obstacles_along(
     return standing
 
 
-def prove_gap(scenario: Scenario, street_map: StreetMap) -> None:
+def prove_gap(scenario: Scenario, street_map: StreetMap, to_spare_m: float = TO_SPARE_M) -> None:
     """Raises SpecError unless start and goal stay connected when all that stands in the way is taken from the walkable
-    area and the rest is eroded by half of the robot's width and TO_SPARE_M: the robot fits past every obstacle."""
-    room = _Room(scenario, street_map)
+    area and the rest is eroded by half of the robot's width and to_spare_m: the robot fits past every obstacle."""
+    room = _Room(scenario, street_map, to_spare_m=to_spare_m)
     if not room.passable(scenario.obstacles):
+        what = "its obstacles leave" if scenario.obstacles else "there is"
         raise SpecError(
-            f"scenario '{scenario.id}': its obstacles leave no gap of {room.gap_m:.2f} m between start and goal: "
+            f"scenario '{scenario.id}': {what} no gap of {room.gap_m:.2f} m between start and goal: "
             "move or remove what stands in the narrowest place"
         )
 
@@ -161,11 +163,13 @@ def prove_gap(scenario: Scenario, street_map: StreetMap) -> None:
 class _Room:
     """The ground around a route and what stands on it. gap_m: that must be left."""
 
-    def __init__(self, scenario: Scenario, street_map: StreetMap, *, beside: bool = False) -> None:
+    def __init__(
+        self, scenario: Scenario, street_map: StreetMap, *, beside: bool = False, to_spare_m: float = TO_SPARE_M
+    ) -> None:
         robot = robot_called(scenario.robot)
         route, line = scenario.route_line, LineString(scenario.route)
         area = shapely.buffer(line, _AROUND_M)
-        self.gap_m = robot.width_m + TO_SPARE_M
+        self.gap_m = robot.width_m + to_spare_m
         self._start, self._goal = Point(scenario.start[:2]), Point(scenario.goal)
         surface = StreetSurface(street_map, scenario.place.seed)
         props = [ground for ground in footprints(surface.standing(area)) if area.intersects(ground)]

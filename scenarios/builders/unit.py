@@ -47,9 +47,10 @@ def build_unit(
     seed: int,
     scenario_id: str,
     robot: Robot = COURIER,
+    way_m: tuple[float, float] = WAY_M,
 ) -> Scenario:
     """A scenario of one structure drawn from `seed`: its street's class is drawn first, so that rare ones come as often
-    as common ones. Raises SpecError when no place for it is found."""
+    as common ones. way_m: of a straight way, shortest and longest. Raises SpecError when no place for it is found."""
     named = zlib.crc32(f"{structure} {place.name}".encode())
     rng = np.random.default_rng([seed, place.seed, 0x0417, named])
     wanted = "crossing" if structure == "crosswalk" else "sidewalk"
@@ -61,14 +62,14 @@ def build_unit(
     if not classes:
         raise MapError(f"map '{street_map.name}' has no {wanted} for '{structure}'")
     ways: dict[Structure, _Draw] = {
-        "straight": lambda strip: _straight(strip, rng, robot),
+        "straight": lambda strip: _straight(strip, rng, robot, way_m),
         "curve": lambda strip: (_round_corner(street_map, graph, strip, rng, robot), ()),
         "crosswalk": lambda strip: _crosswalk(street_map, strip, rng, robot),
     }
 
     def draw(strips: list[Strip]) -> Scenario:
         route, crossings = ways[structure](strips[int(rng.integers(len(strips)))])
-        if not WAY_M[0] <= route.length_m <= WAY_M[1]:
+        if not way_m[0] <= route.length_m <= way_m[1]:
             raise SpecError("the way is too short or too long")
         if on_road_m(street_map, route, crossings) > _OFF_ROAD_M:
             raise SpecError("the way lies on a road")
@@ -108,8 +109,10 @@ def _may_be(strip: Strip, structure: Structure, robot: Robot) -> bool:
     return strip.width_m >= robot.width_m + 2.0 * _BESIDE_ROBOT_M
 
 
-def _straight(strip: Strip, rng: np.random.Generator, robot: Robot) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
-    layout = SidewalkLayout(WAY_M, (0.0, 0.0), robot.width_m / 2 + _BESIDE_ROBOT_M)
+def _straight(
+    strip: Strip, rng: np.random.Generator, robot: Robot, way_m: tuple[float, float]
+) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
+    layout = SidewalkLayout(way_m, (0.0, 0.0), robot.width_m / 2 + _BESIDE_ROBOT_M)
     return Polyline(along_sidewalk(layout, strip, rng, robot).route), ()
 
 

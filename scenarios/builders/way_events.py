@@ -25,7 +25,7 @@ _FROM_START_M, _FROM_GOAL_M = 30.0, 20.0
 _LOOK_M: Final = 45.0
 """So far ahead room is looked for, for one kind after the other."""
 _STEP_M: Final = 2.5
-_BEND_M: Final = 0.4
+BENDS_M: Final = 0.4
 _SLACK_M: Final = 2.0
 _SPEEDS_MPS: Final = (1.1, 1.65)
 _CROSSING_M: Final = (5.0, 12.0)
@@ -36,7 +36,7 @@ _BESIDE_CROSSING_M: Final = 1.0
 """So far before and behind such a crosswalk the way is straight, as in the scenarios of that event alone."""
 
 
-class _Spot(NamedTuple):
+class WaySpot(NamedTuple):
     """Where an event may be. half_length_m: of a crosswalk, else 0."""
 
     s_m: float
@@ -57,14 +57,14 @@ def draw_events(
     on_crosswalks = [kind for kind in kinds.values() if kind.layout is None]
     turns = [kind for kind in kinds.values() if kind.layout is not None]
     turns = [turns[int(i)] for i in rng.permutation(len(turns))]
-    chosen: list[tuple[_Spot, EventKind]] = []
-    for spot in _crosswalks(street_map, route, crossings):
+    chosen: list[tuple[WaySpot, EventKind]] = []
+    for spot in crosswalk_spots(street_map, route, crossings):
         inside = _FROM_START_M <= spot.s_m <= route.length_m - _FROM_GOAL_M
         if on_crosswalks and inside and rng.random() < _ON_CROSSWALKS and _apart(spot, chosen):
             chosen.append((spot, on_crosswalks[int(rng.integers(len(on_crosswalks)))]))
     wide_m = 2.0 * (robot.width_m + BESIDE_EVENT_M)
     spots = [
-        _Spot(s_m, strip.width_m / 2)
+        WaySpot(s_m, strip.width_m / 2)
         for s_m in np.arange(_FROM_START_M, route.length_m - _FROM_GOAL_M, _STEP_M).tolist()
         if (strip := _sidewalk_at(street_map, way, route, s_m)) is not None and strip.width_m >= wide_m
     ]
@@ -85,7 +85,7 @@ def draw_events(
 
 
 def _event(
-    event_id: str, kind: EventKind, spot: _Spot, route: Polyline, robot: Robot, rng: np.random.Generator
+    event_id: str, kind: EventKind, spot: WaySpot, route: Polyline, robot: Robot, rng: np.random.Generator
 ) -> Event:
     pose = route.at(spot.s_m)
     before, behind = (route.at(spot.s_m + d_m) for d_m in (-spot.half_length_m, spot.half_length_m))
@@ -105,30 +105,30 @@ def _event(
     )
 
 
-def _apart(spot: _Spot, chosen: Sequence[tuple[_Spot, EventKind]]) -> bool:
+def _apart(spot: WaySpot, chosen: Sequence[tuple[WaySpot, EventKind]]) -> bool:
     return all(abs(spot.s_m - other.s_m) >= _APART_M for other, _ in chosen)
 
 
-def _crosswalks(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> list[_Spot]:
+def crosswalk_spots(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing]) -> list[WaySpot]:
     """The route's crossings without signals that it leads straight over and that are neither short nor long."""
     found = []
     for crossing in crossings:
         strip, half_m = street_map.strips[crossing.id], 0.5 * (crossing.leave_s_m - crossing.enter_s_m)
         from_m, to_m = crossing.enter_s_m - _BESIDE_CROSSING_M, crossing.leave_s_m + _BESIDE_CROSSING_M
         fits = not crossing.signalised and _CROSSING_M[0] <= 2.0 * half_m <= _CROSSING_M[1]
-        if fits and _is_straight(route, from_m, to_m, _CROSSING_BEND_M):
-            found.append(_Spot(crossing.enter_s_m + half_m, strip.width_m / 2, half_m))
+        if fits and is_straight_between(route, from_m, to_m, _CROSSING_BEND_M):
+            found.append(WaySpot(crossing.enter_s_m + half_m, strip.width_m / 2, half_m))
     return found
 
 
-def _has_room(kind: EventKind, spot: _Spot, route: Polyline, robot: Robot) -> bool:
+def _has_room(kind: EventKind, spot: WaySpot, route: Polyline, robot: Robot) -> bool:
     """Whether the sidewalk is wide enough for a kind, and straight as far before and behind as its scenarios are."""
     layout = kind.layout
     if layout is None or spot.half_width_m < layout.half_width_m + wider_m(robot):
         return False
     from_m = spot.s_m - layout.event_m[1] - _SLACK_M
     to_m = spot.s_m + max(2.0 * _STEP_M, layout.way_m[0] - layout.event_m[0])
-    return from_m >= 0.0 and to_m <= route.length_m and _is_straight(route, from_m, to_m)
+    return from_m >= 0.0 and to_m <= route.length_m and is_straight_between(route, from_m, to_m)
 
 
 def _sidewalk_at(street_map: StreetMap, way: Sequence[Port], route: Polyline, s_m: float) -> Strip | None:
@@ -138,7 +138,7 @@ def _sidewalk_at(street_map: StreetMap, way: Sequence[Port], route: Polyline, s_
     return strip if strip is not None and strip.kind == "sidewalk" and strip.id in {p.strip for p in way} else None
 
 
-def _is_straight(route: Polyline, from_m: float, to_m: float, bend_m: float = _BEND_M) -> bool:
+def is_straight_between(route: Polyline, from_m: float, to_m: float, bend_m: float = BENDS_M) -> bool:
     """Whether the route bends by less than so much between two of its arc lengths."""
     chord = Polyline([route.at(from_m).xy, route.at(to_m).xy])
     between = route.points[(route.s_m > from_m) & (route.s_m < to_m)]

@@ -64,7 +64,7 @@ def _file(path: Path) -> Place:
     if path.name == NET_NAME and path.with_name(ABOUT_NAME).is_file():
         return _folder(path.parent)
     if path.name.endswith((".net.xml", ".net.xml.gz")) or path.name == "net.xml":
-        return CityMap(map=_imported(path))
+        return CityMap(map=imported_place(path))
     raise UsageError(f"{path}: cannot be run on as it is: import it first with `cosim map import {path}`")
 
 
@@ -91,11 +91,11 @@ def _city(folder: Path) -> Place:
         with suppress(MapError):
             city_net(made.city)
             return made.city
-    return CityMap(map=_imported(net))
+    return CityMap(map=imported_place(net))
 
 
-def _imported(net: Path) -> str:
-    """The name of a net in the store of maps, where it is imported unless it is there."""
+def imported_place(net: Path) -> str:
+    """The name of a map's file in the store of maps, where it is imported unless it is there."""
     source_hash, wanted = file_hash(net), map_name(net)
     name = _free_name(wanted, source_hash, lambda about: about.source_hash == source_hash and _as_it_is(about))
     if not (maps_folder() / name).exists():

@@ -132,7 +132,7 @@ def test_several_faults_are_told_at_once(tmp_path: Path) -> None:
         "5 faults:",
         "  Object contains unknown field `gaol` - at `$.scenarios[0]`. Valid choices: " + ", ".join(
             sorted(first.keys() - {"gaol"}, key=list(msgspec.to_builtins(load_suite("reactive").scenarios[0])).index)
-        ),
+        ) + ". Did you mean goal?",
         "  Expected `int`, got `str` - at `$.scenarios[0].seed`",
         "  crowd persons must be in [0, 1000], not -1; crowd groups must be a share in [0, 1], not 2.0"
         " - at `$.scenarios[0].crowd`",

@@ -1,0 +1,125 @@
+"""From files of own scenarios to scenarios: one file, map and versions make the same ones, with the same hashes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import msgspec
+
+from cosim.core.errors import CosimError, MachineError, SpecError
+from cosim.core.telling import Tell, untold
+from cosim.spec.robot import robot_called
+from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
+from cosim.spec.spec_file import in_lines
+from scenarios.builders.obstacles import with_obstacles
+from scenarios.builders.reactive import NO_CROWD
+from scenarios.execution.places import place
+from scenarios.own.along import event_along, obstacle_along
+from scenarios.own.format import OwnCrowd, OwnLimits, OwnPlace, OwnScenario
+from scenarios.own.reading import OwnFile, Variant
+from scenarios.own.ways import laid_way
+from sumo_nets.maps.place_names import imported_place, place_called
+
+_MAKING: Final = "making the scenarios"
+_VERSION: Final = "own"
+_SLOWEST_MPS, _LEAST_S = 0.2, 60.0
+"""A time limit that is not given is a minute and what the way takes at this speed."""
+
+
+class Made(NamedTuple):
+    """A scenario that could be made, or why not: as "way: ...", one message each."""
+
+    variant: Variant
+    scenario: Scenario | None
+    faults: tuple[str, ...]
+
+
+def made_of(file: OwnFile, tell: Tell = untold) -> Iterator[Made]:
+    """Each scenario of a file, or what is against it. What the machine lacks is raised as MachineError."""
+    for number, variant in enumerate(file.variants):
+        tell(f"{_MAKING} of {file.path.name}", number / len(file.variants))
+        yield made_one(variant, file.name)
+
+
+def made_one(variant: Variant, suite: str) -> Made:
+    """One scenario of a file, or what is against it; suite: the name of the file's scenarios."""
+    try:
+        return Made(variant, _scenario(variant, suite), ())
+    except MachineError:
+        raise
+    except CosimError as error:
+        return Made(variant, None, tuple(str(error).split("\n")))
+
+
+def suite_of_own(file: OwnFile, tell: Tell = untold) -> Suite:
+    """All scenarios of a file, to be run. Raises SpecError with everything that is against it."""
+    made = list(made_of(file, tell))
+    if faults := dict.fromkeys(fault for one in made for fault in one.faults):
+        raise SpecError(f"{file.path}: {in_lines(list(faults), len(faults))}")
+    scenarios = tuple(one.scenario for one in made if one.scenario is not None)
+    return Suite(name=file.name, version=_VERSION, scenarios=scenarios, description=file.description)
+
+
+def place_of_own(own: OwnPlace) -> Place:
+    """The place that a file means; a map's file is imported when it is first used. Raises UsageError, MapError."""
+    if own.city is not None:
+        return City(seed=own.city, size_m=own.size_m, style=own.style, roughness=own.roughness)
+    if own.map:
+        return CityMap(map=own.map, roughness=own.roughness)
+    path = Path(own.file)
+    if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
+        return CityMap(map=imported_place(path), roughness=own.roughness)
+    return place_called(own.file, own.roughness)
+
+
+def _scenario(variant: Variant, suite: str) -> Scenario:
+    own = variant.own
+    alike = {"name": "own", "goal_protocol": None, "crowd": OwnCrowd(), "light": Light(), "limits": OwnLimits()}
+    street = _street(msgspec.structs.replace(own, **alike))
+    limits = own.limits
+    time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
+    return msgspec.structs.replace(
+        street,
+        id=variant.id,
+        suite=suite,
+        crowd=own.crowd.spec,
+        light=own.light,
+        goal_radius_m=limits.goal_radius_m,
+        time_limit_s=time_s,
+        ends_on_failure=limits.ends_on_failure,
+        ends_at=limits.ends_at,
+    )
+
+
+@lru_cache(maxsize=1024)
+def _street(own: OwnScenario) -> Scenario:
+    """A scenario with all that stands and happens on its way; who walks there and the light come later."""
+    where, robot = _place(own.place), robot_called(own.robot)
+    _, street_map = place(where)
+    bare = laid_way(own.way, where, street_map, own.seed, robot)
+    faults: list[str] = []
+    events, placed = [], []
+    for number, event in enumerate(own.events):
+        try:
+            events.append(event_along(number, event, bare, street_map, robot))
+        except SpecError as error:
+            faults.append(f"events[{number}]: {error}")
+    for number, thing in enumerate(own.obstacles.placed):
+        try:
+            placed.append(obstacle_along(thing, bare.route_line))
+        except SpecError as error:
+            faults.append(f"obstacles.placed[{number}]: {error}")
+    if faults:
+        raise SpecError("\n".join(faults))
+    whole = msgspec.structs.replace(
+        bare, events=tuple(events), obstacles=tuple(placed), crowd=NO_CROWD, light=Light(), ends_at="goal"
+    )
+    if not own.obstacles.per_100m:
+        return whole
+    return with_obstacles(whole, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside)
+
+
+_place = lru_cache(maxsize=64)(place_of_own)

@@ -1,0 +1,253 @@
+"""Scenarios of one's own in TOML files: what may stand in them, what becomes of it, and every refusal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import SpecError
+from cosim.spec.robot import COURIER
+from cosim.spec.scenario import City, Scenario
+from scenarios.own.along import event_along
+from scenarios.own.format import OwnEvent, OwnScenario, OwnWay
+from scenarios.own.reading import read_own
+from scenarios.own.ways import laid_way
+from tests.conftest import ROOT, Cosim
+from tests.tiny_street import tiny_map
+
+CITY = "[place]\ncity = 1\nsize_m = 500\n"
+SHORT = f'name = "short"\n{CITY}[way]\nkind = "straight"\nlength_m = 30\n'
+TEMPLATE = ROOT / "scenarios" / "own" / "template.toml"
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "own.toml"
+    path.write_text(text)
+    return path
+
+
+def refusal(folder: Path, text: str) -> str:
+    path = written(folder, text)
+    with pytest.raises(SpecError) as told:
+        read_own(path)
+    assert str(told.value).startswith(f"{path}: ")
+    return str(told.value).removeprefix(f"{path}: ")
+
+
+def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) -> None:
+    """Types, ranges, names and what contradicts itself: the field, what was found, what may stand there."""
+    told = refusal(
+        tmp_path,
+        'name = "a b"\nseed = "x"\nrobot = "tank"\nsizes = 1\n'
+        '[place]\ncity = 1\nmap = "berlin-11"\n[way]\nkind = "strait"\nlenght_m = 40\n'
+        '[[events]]\nkind = "fronal"\nat_m = "far"\n[[events]]\npeople = 0\n'
+        '[crowd]\ngroups = 2\n[light]\nhour = 25\n[limits]\nends_at = "noon"\n',
+    )
+    head, *faults = told.splitlines()
+    assert head == f"{len(faults)} faults:"
+    for fault in (
+        "unknown field `sizes`. Valid choices: name, description, seed, seeds, robot,",
+        "name 'a b' cannot name a scenario: use 1 to 100 of",
+        "seed: must be a whole number, not 'x'",
+        "robot: unknown robot 'tank'. Valid choices: courier, scout.",
+        "place: give one of city, map, file, not city and map",
+        "place.map: unknown map 'berlin-11'. Valid choices: ",
+        "way: unknown field `lenght_m`. Valid choices: kind, length_m, start, goal, route, fences, signals. "
+        "Did you mean length_m?",
+        "way.kind: Invalid enum value 'strait'. Valid choices: straight, curve, crosswalk, route. "
+        "Did you mean straight?",
+        "events[0].kind: unknown event 'fronal'. ",
+        "events[0].at_m: must be a number, not 'far'",
+        "events[1]: there is no `kind`",
+        "events[1]: people must be in [1, 100], not 0",
+        "crowd groups must be a share in [0, 1], not 2.0",
+        "light hour must be in [0, 24], not 25.0",
+        "limits.ends_at: Invalid enum value 'noon'. Valid choices: goal, stop",
+    ):
+        assert sum(line.strip().startswith(fault) for line in faults) == 1, fault
+    assert len(faults) == 15
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("[", "is no TOML: "),
+        ('name = "a"\nname = "b"', "is no TOML: Cannot overwrite a value (at end"),
+        ("", "3 faults:\n  there is no `name`\n  there is no `place`\n  there is no `way`"),
+        (f'name = "n"\n{CITY}[way]\n', "way: give one of kind, start and goal, route, not none"),
+        (f'name = "n"\n{CITY}[way]\nstart = [1, 2]\n', "way: start and goal go together; goal is missing"),
+        (f'name = "n"\n{CITY}[way]\nstart = [1, 2, 3]\ngoal = [1, 2]', "way.start: must be a list of 2 values, not [1"),
+        (f'name = "n"\n{CITY}[way]\nkind = "curve"\nlength_m = 20\n', "way length_m is for ways of kind 'straight'"),
+        (SHORT.replace("30", "300"), "way length_m of kind 'straight' must be in [10, 100], not 300"),
+        (SHORT.replace('"short"', '"unit"'), "name 'unit' is that of a suite that ships: choose another"),
+        (SHORT + "[crowd]\npersons = 3\ndensity = 2.0\n", "crowd: give persons (3) or density (2), not both"),
+        (SHORT + "[crowd]\ndensity = [0, 900]\n", "crowd density must be in [0, 150] per 1000 m2, not 900.0"),
+        (SHORT + "[crowd]\ndensity = []\n", "crowd.density is an empty list: give values to sweep over"),
+        (SHORT + "[crowd]\ndensity = [nan]\n", "crowd density must be in [0, 150] per 1000 m2, not nan"),
+        (
+            "seeds = 1000\n" + SHORT + "[light]\nhour = [8, 9, 10, 11, 12, 13]\n",
+            "makes 6000 scenarios, and at most 5000 can be had: give fewer values or seeds",
+        ),
+        ("seeds = [1, 2]\n" + SHORT, "seeds: must be a whole number, not [1, 2]"),
+    ],
+    ids=[
+        "syntax", "twice", "empty", "no-way", "no-goal", "three-numbers", "no-length", "too-long", "name-of-a-suite",
+        "both", "one-value", "no-value", "no-number", "too-many", "list-of-seeds",
+    ],
+)  # fmt: skip
+def test_what_cannot_be_is_refused_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
+    """One fault of a file that is else sound."""
+    assert refusal(tmp_path, text).startswith(told)
+
+
+def test_what_is_no_text_is_refused(tmp_path: Path) -> None:
+    """Bytes, a folder, nothing, too much, brackets without end: one line each."""
+    path = tmp_path / "own.toml"
+    for data, told in (
+        (b'name = "\xff"', "is no UTF-8 text, line 1"),
+        (b"#" * 1_000_001, "holds more than 1000000 bytes"),
+        (b"a = " + b"[" * 100_000, "is n"),
+    ):
+        path.write_bytes(data)
+        with pytest.raises(SpecError, match=told):
+            read_own(path)
+    for nowhere, told in ((tmp_path, "is no file"), (tmp_path / "b.toml", "`cosim scenario new .*b.toml` writes one")):
+        with pytest.raises(SpecError, match=told):
+            read_own(nowhere)
+
+
+def test_a_list_in_place_of_a_value_is_a_sweep(tmp_path: Path) -> None:
+    """Each value with each of the others, as often as there are seeds; points and fields of single events as well."""
+    text = (
+        f'name = "s"\nseed = 7\nseeds = 2\n{CITY}[way]\nstart = [120, 131]\ngoal = [[345, 300], [250, 240]]\n'
+        '[[events]]\nkind = "frontal"\nspeed_mps = [1.1, 1.5]\n[crowd]\ndensity = [0, 2.5]\n'
+    )
+    own = read_own(written(tmp_path, text))
+    assert [axis.field for axis in own.axes] == ["way.goal", "events[0].speed_mps", "crowd.density"]
+    assert len(own.variants) == 16 == len({variant.id for variant in own.variants})
+    first, second, *_, last = own.variants
+    assert (first.id, second.id) == (
+        "s-goal345_300-speed_mps1.1-density0-s7", "s-goal345_300-speed_mps1.1-density0-s8",
+    )  # fmt: skip
+    assert first.own.crowd.spec.empty and last.own.crowd.density == 2.5 and last.own.events[0].speed_mps == 1.5
+    assert last.own.way.goal == (250.0, 240.0) and last.own.seed == 8
+    assert last.at == {"way.goal": [250, 240], "events[0].speed_mps": 1.5, "crowd.density": 2.5}
+
+
+def test_the_template_shows_every_field_there_is() -> None:
+    """Who reads it knows all that may stand in a file."""
+    lines = [line.removeprefix("# ") for line in TEMPLATE.read_text().splitlines()]
+    shown = {line.split(" ")[0] for line in lines}
+
+    def fields(kind: Any) -> set[str]:
+        found = set()
+        for field in msgspec.structs.fields(kind):
+            inner = [field.type, *getattr(field.type, "__args__", ())]
+            tables = [one for one in inner if isinstance(one, type) and issubclass(one, msgspec.Struct)]
+            found |= {field.name} if not tables else set().union(*map(fields, tables))
+        return found
+
+    assert fields(OwnScenario) - shown == {"shadows", "hdri", "paint"}
+
+
+def on_tiny(**way: Any) -> Scenario:
+    return laid_way(OwnWay(**way), City(seed=1), tiny_map(), 0, COURIER)
+
+
+def test_the_way_between_two_points_leads_over_the_crossing() -> None:
+    """From the middle of the nearest sidewalk to that of the other, by the crossing that joins them."""
+    over = on_tiny(start=(-40.0, 6.0), goal=(30.0, -7.0))
+    assert over.start[:2] == (-40.0, 5.0) and over.goal == (30.0, -6.5)
+    assert [(crossing.id, crossing.signalised) for crossing in over.crossings] == [(":c0", False)]
+    assert over.route_line.length_m == pytest.approx(40 + 30 + 11.5, abs=4.0)
+    along = on_tiny(start=(-40.0, 5.0), goal=(-10.0, 5.0))
+    assert not along.crossings and along.route_line.length_m == pytest.approx(30.0)
+    given = on_tiny(route=((0.0, 5.0), (0.0, -6.0)))
+    assert [crossing.id for crossing in given.crossings] == [":c0"]
+
+
+@pytest.mark.parametrize(
+    ("way", "told"),
+    [
+        ({"start": (-40, 30), "goal": (30, 5)}, r"way.start \(-40, 30\) is 24 m from the near.*\(-40.0, 5.0\)"),
+        ({"start": (-40, 5), "goal": (-40.2, 5)}, "start and goal are on one spot"),
+        ({"start": (-40, 5), "goal": (30, 5), "signals": "with"}, "way signals 'with': it leads over 0 cross"),
+    ],
+    ids=["far", "one-spot", "no-signals"],
+)  # fmt: skip
+def test_a_way_that_is_not_there_is_refused(way: dict[str, Any], told: str) -> None:
+    """With what is there instead."""
+    with pytest.raises(SpecError, match=told):
+        on_tiny(**way)
+
+
+def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
+    """The reason, and the stretches of this way that do."""
+    street, over = tiny_map(), on_tiny(start=(-60.0, 5.0), goal=(60.0, -6.5))
+
+    def at(kind: str, at_m: float | None) -> Any:
+        return event_along(0, OwnEvent(kind=kind, at_m=at_m), over, street, COURIER)
+
+    for kind, at_m, told in (
+        (
+            "frontal",
+            5.0,
+            "before the robot is there, 21 m from the start or farther; it fits from 21 to ",
+        ),
+        ("frontal", 63.0, "no sidewalk is there, but a corner or a crossing"),
+        ("frontal", 900.0, "the way ends at "),
+        ("conversing", 30.0, "is 3.0 m wide there, and it needs 3.9 m; it fits nowhere on this way"),
+        ("ped_crossing", 10.0, "at_m 10 is on no crossing for 'ped_crossing': it fits from 6"),
+    ):
+        with pytest.raises(SpecError) as error:
+            at(kind, at_m)
+        assert told in str(error.value), error.value
+    crossing, frontal = at("ped_crossing", None), at("frontal", 30.0)
+    assert np.hypot(crossing.x_m, crossing.y_m) < 2.0 and crossing.half_length_m > 2.0
+    assert (frontal.x_m, frontal.y_m, frontal.heading_rad, frontal.half_width_m) == (-30.0, 5.0, 0.0, 1.5)
+    middle = at("obstructing", None)
+    assert abs(middle.route_s_m - over.route_line.length_m / 2) < 12.0
+
+
+@pytest.mark.engine
+def test_what_is_written_anew_is_sound_and_can_be_drawn(tmp_path: Path, cosim: Cosim) -> None:
+    """`new`, `check`, `draw`: from nothing to a picture; a name that is taken, or no place to write to, is refused."""
+    done = cosim("scenario", "new", "mine.toml", cwd=tmp_path)
+    assert done.returncode == 0 and (tmp_path / "mine.toml").read_text().count('name = "mine"') == 1
+    again, done = (cosim("scenario", *words, cwd=tmp_path) for words in (("new", "mine.toml"), ("check", "mine.toml")))
+    assert again.returncode == 2 and "is there already" in again.stderr
+    assert done.returncode == 0 and "mine.toml: 1 scenario" in done.stdout and " 40.0 " in done.stdout, done.stderr
+    for words in (("-o", "way.png"), ("--whole", "-o", "town.png")):
+        done = cosim("scenario", "draw", "mine.toml", *words, cwd=tmp_path)
+        assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(b"\x89PNG"), done.stderr
+
+
+@pytest.mark.engine
+def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim: Cosim) -> None:
+    """Events, things, their room: each with its place in the file; sound files are told of all the same."""
+    (tmp_path / "sound.toml").write_text(SHORT)
+    (tmp_path / "odd.toml").write_text(
+        SHORT + '[[events]]\nkind = "frontal"\nat_m = 2\n[[events]]\nkind = "ped_crossing"\n'
+        '[[obstacles.placed]]\nkind = "bin"\nat_m = 99\n'
+    )
+    (tmp_path / "blocked.toml").write_text(
+        SHORT + '[[obstacles.placed]]\nkind = "bin"\nat_m = 0.3\n[[events]]\nkind = "queueing"\npeople = 9\n'
+    )  # fmt: skip
+    fences = (f'[[obstacles.placed]]\nkind = "fence"\nat_m = 15\nturned_deg = 90\nleft_m = {m}\n' for m in (-0.9, 0.9))
+    (tmp_path / "narrow.toml").write_text(SHORT + "".join(fences))
+    files = ("odd.toml", "sound.toml", "blocked.toml", "narrow.toml")
+    done = cosim("scenario", "check", *files, cwd=tmp_path)
+    assert done.returncode == 2 and "sound.toml: 1 scenario" in done.stdout
+    for told in (
+        "odd.toml: events[0]: at_m 2 does not do for 'frontal'",
+        "odd.toml: events[1]: 'ped_crossing' needs a crossing without signals",
+        "odd.toml: obstacles.placed[0]: at_m 99 is past the goal: the way is 30.0 m long",
+        "blocked.toml: obstacles[0] (bin) stands where the robot starts",
+        "narrow.toml: its obstacles leave no gap of ",
+        "blocked.toml: event 'e0': people of 'queueing' must be 2 to 5, not 9",
+    ):
+        assert told in done.stderr, done.stderr
