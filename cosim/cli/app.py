@@ -27,7 +27,8 @@ from cosim.cli.progress import doing
 from cosim.cli.scenario import scenario_app
 from cosim.cli.score import score
 from cosim.cli.suite import suite_app
-from cosim.core.errors import BROKEN_MACHINE, INTERRUPTED, SOME_CRASHED, CosimError, EngineError, UsageError, unknown
+from cosim.cli.verify import doctor, verify
+from cosim.core.errors import INTERRUPTED, SOME_CRASHED, CosimError, UsageError, unknown
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -320,25 +321,8 @@ def show(
         out.print(f"Picture: {path}", soft_wrap=True)
 
 
-@app.command(epilog="Example:  \n`cosim doctor`")
-def doctor() -> None:
-    """Check that every engine works here: versions, a frame, a query, a step."""
-    try:
-        from scenarios.checks import CHECKS
-    except ImportError as error:
-        raise EngineError(f"an engine cannot be loaded: {error}. Mend what it names, or set up anew") from error
-
-    failed = 0
-    for name, check in CHECKS.items():
-        try:
-            out.print(f"[green]ok[/]      {name}: {check()}", soft_wrap=True)
-        except Exception as error:  # noqa: BLE001  a check may fail in any way; it is shown and counted
-            failed += 1
-            out.print(f"[red]failed[/]  {name}: {type(error).__name__}: {escape(str(error))}", soft_wrap=True)
-    if failed:
-        raise typer.Exit(BROKEN_MACHINE)
-
-
+app.command(epilog="Example:  \n`cosim doctor`")(doctor)
+app.command(epilog="Examples:  \n`cosim verify`  \n`cosim verify --case lh-001-00 --case frontal-001`")(verify)
 app.command(
     rich_help_panel=LOOK,
     epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`",

@@ -1,0 +1,108 @@
+"""What an installation must give, as it lies beside the suites: verify.json."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from pathlib import Path
+from typing import Final
+
+import msgspec
+
+from cosim.core.errors import CosimError, EngineError, RunError, unwritable
+from cosim.core.versions import versions
+from cosim.core.whole_file import write_whole
+from cosim.spec.scenario import Scenario
+from physics.cameras.choice import camera_of_choice, renderer_of
+from scenarios.catalog import SUITES, load_suite
+from scenarios.verifying.engines import DRIVER, engines_alone, room_hashes, textures
+from scenarios.verifying.traces import Trace, traced
+
+SHIPPED: Final = next(iter(SUITES.values())).parent / "verify.json"
+_SCHEMA: Final = 1
+
+
+class Given(msgspec.Struct, frozen=True, kw_only=True):
+    """What an installation gives. renderer: of the gl camera, "" without one; traces: by case, or why there is none."""
+
+    schema: int = _SCHEMA
+    versions: dict[str, str]
+    renderer: str
+    suites: dict[str, str]
+    sources: dict[str, str]
+    alone: dict[str, str]
+    textures: dict[str, str]
+    traces: dict[str, Trace | str]
+
+    def save(self, path: Path) -> None:
+        """Write as JSON, whole or not at all. Raises MachineError."""
+        data = msgspec.json.format(msgspec.json.encode(self), indent=1) + b"\n"
+        try:
+            write_whole(path, data)
+        except OSError as error:
+            raise unwritable(path, error) from error
+
+    @classmethod
+    def load(cls, path: Path) -> Given:
+        """Raises RunError that names the file and the remedy."""
+        try:
+            given = msgspec.json.decode(path.read_bytes(), type=cls)
+        except (OSError, msgspec.DecodeError) as error:
+            raise RunError(f"{path}: holds nothing to verify by: {error}. Install anew") from error
+        if given.schema != _SCHEMA:
+            raise RunError(f"{path}: schema {given.schema}; this version reads {_SCHEMA}. Install anew")
+        return given
+
+
+def given_here(cases: Sequence[Scenario], jobs: int, tell: Callable[[str], None]) -> Given:
+    """What this installation gives: `jobs` processes, or this one. tell: is told the name of what is under way."""
+    tell("the engines alone")
+    alone = engines_alone()
+    tell("textures")
+    pictures = textures()
+    traces: dict[str, Trace | str] = {}
+    if jobs == 1:
+        for case in cases:
+            tell(case.id)
+            traces[case.id] = trace_of(case)
+    else:
+        context = multiprocessing.get_context("spawn")
+        with ProcessPoolExecutor(jobs, context) as pool:
+            under_way = {case.id: pool.submit(trace_of, case) for case in cases}
+            for name, one in under_way.items():
+                tell(name)
+                try:
+                    traces[name] = one.result()
+                except BrokenProcessPool:
+                    raise EngineError(
+                        f"a process died in {name} or beside it: try --jobs 1, and `cosim doctor`"
+                    ) from None
+    return Given(
+        versions=versions(),
+        renderer=renderer_of(camera_of_choice("gl")) if DRIVER in alone else "",
+        suites={name: load_suite(name).content_hash for name in SUITES},
+        sources=room_hashes(),
+        alone=alone,
+        textures=pictures,
+        traces=traces,
+    )
+
+
+def trace_of(case: Scenario) -> Trace | str:
+    """The trace of a case; what went wrong, in words, where there is none."""
+    try:
+        return traced(case)
+    except CosimError as error:
+        return str(error)
+
+
+def writable(given: Given, cases: Sequence[str]) -> Given:
+    """What may be shipped: all cases, each run, by both cameras. Raises RunError."""
+    broken = [f"{name} ({trace})" for name, trace in given.traces.items() if isinstance(trace, str)]
+    lacking = [name for name in cases if name not in given.traces]
+    if broken or lacking or not given.renderer:
+        why = f"cases that did not run: {', '.join(broken + lacking)}" if broken or lacking else "there is no gl camera"
+        raise RunError(f"what is shipped is made of all cases and both cameras, and here {why}")
+    return given

@@ -1,0 +1,240 @@
+"""cosim verify: the shipped values are of the shipped suites, and whatever is planted is found and named."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import RunError
+from cosim.core.state import Frame
+from scenarios.catalog import SUITES, load_suite
+from scenarios.verifying import engines
+from scenarios.verifying.cases import verified_cases
+from scenarios.verifying.engines import DRIVER, ROOMS, room_hashes, textures
+from scenarios.verifying.shipped import SHIPPED, Given, writable
+from scenarios.verifying.traces import Trace, kept_picture, traced
+from scenarios.verifying.verdict import blamed, findings, first_difference
+from sumo_nets.crowd import pose_filter
+from tests.conftest import ROOT, Cosim
+
+REMADE = "the suites were built anew: `cosim verify --write`"
+replace = msgspec.structs.replace
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Given:
+    return Given.load(SHIPPED)
+
+
+def test_what_is_shipped_is_of_the_shipped_suites(shipped: Given) -> None:
+    """Twelve cases by the rule, of all three suites, each with both pictures."""
+    assert shipped.suites == {name: load_suite(name).content_hash for name in SUITES}, REMADE
+    cases = verified_cases()
+    assert [case.id for case in cases] == [*shipped.traces] and len(cases) == 12, REMADE
+    assert {case.suite for case in cases} == {*SUITES}
+    kinds = [case.structure for case in cases]
+    assert len({*kinds}) == 12 and {"straight", "frontal", "gesturing", "route"} < {*kinds}
+    for trace in shipped.traces.values():
+        assert isinstance(trace, Trace) and {*trace.pictures} == {"bullet", "gl"}
+    assert writable(shipped, [case.id for case in cases]) is shipped
+
+
+def told(shipped: Given, here: Given) -> tuple[list[str], str]:
+    """What differs, and all that is said of it."""
+    wrong = [one for one in findings(shipped, here) if not one.fine]
+    words = [f"{one.name}: {one.words}" for one in wrong]
+    return [one.name for one in wrong], "\n".join([*words, *blamed(wrong, shipped, here)])
+
+
+def changed_at(trace: Trace, part: str, tick: int) -> Trace:
+    """A trace of which a part is another one from a tick on, and so is what comes after it."""
+    at = 3 * (tick + 1)
+    other = "".join("0" if digit != "0" else "1" for digit in trace.ticks[part][at:])
+    later = {name: digits[: at + 3] + "fff" for name, digits in trace.ticks.items()}
+    return replace(trace, ticks=later | {part: trace.ticks[part][:at] + other}, state_hash="other")
+
+
+def with_trace(given: Given, case: str, change: Callable[[Trace], Trace | str]) -> Given:
+    trace = given.traces[case]
+    assert isinstance(trace, Trace)
+    return replace(given, traces=given.traces | {case: change(trace)})
+
+
+def test_the_shipped_installation_is_found_whole(shipped: Given) -> None:
+    """Beside itself nothing differs, and there is a line for every case."""
+    assert told(shipped, shipped) == ([], "")
+    assert {*shipped.traces} < {one.name for one in findings(shipped, shipped)}
+
+
+PLANTED: dict[str, tuple[Callable[[Given], Given], list[str], tuple[str, ...]]] = {
+    "package": (
+        lambda g: replace(g, versions=g.versions | {"numpy": "9.9"}),
+        ["package numpy"],
+        ("9.9 here", "pip install --require-hashes -r requirements.lock"),
+    ),
+    "suite": (
+        lambda g: replace(g, suites=g.suites | {"unit": "0"}),
+        ["suite unit"],
+        ("it was edited. Take it as it was shipped",),
+    ),
+    "engine": (
+        lambda g: replace(
+            with_trace(g, "lh-001-00", lambda t: changed_at(t, "crowd", 7)), alone=g.alone | {"SUMO": "0"}
+        ),
+        ["SUMO alone", "lh-001-00"],
+        ("the engine itself", "the crowd first, at 0.35 s", "SUMO alone gives something else, too. Remedy: pip"),
+    ),
+    "crowd": (
+        lambda g: replace(
+            with_trace(g, "lh-001-00", lambda t: changed_at(t, "crowd", 7)),
+            sources=g.sources | {"sumo_nets/crowd": "0"},
+        ),
+        ["lh-001-00"],
+        (
+            "the crowd first, at 0.35 s; what follows hangs on it",
+            "SUMO alone gives what it should, so it is ours; the source of sumo_nets/crowd is not the shipped one",
+            "Remedy: take the source as it was shipped",
+        ),
+    ),
+    "people": (
+        lambda g: with_trace(g, "frontal-001", lambda t: changed_at(t, "events", 40)),
+        ["frontal-001"],
+        ("our event pedestrians first, at 2.00 s", "something changes scenarios/events, cosim/people"),
+    ),
+    "policy": (
+        lambda g: with_trace(g, "lateral-001", lambda t: changed_at(t, "policy", 0)),
+        ["lateral-001"],
+        ("the policy first, at 0.00 s",),
+    ),
+    "physics": (
+        lambda g: with_trace(g, "curve-001", lambda t: changed_at(t, "robot", -1)),
+        ["curve-001"],
+        ("the robot's physics first, before it begins", "PyBullet alone gives what it should"),
+    ),
+    "metrics": (
+        lambda g: with_trace(g, "curve-001", lambda t: replace(t, measures=t.measures | {"spl": 0.123})),
+        ["curve-001"],
+        ("the same to the bit, but not measured so: spl", "the metrics: "),
+    ),
+    "texture": (
+        lambda g: replace(
+            g,
+            textures=g.textures | {"ground asphalt": "0"},
+            sources=g.sources | {"physics/textures": "0"},
+        ),
+        ["textures"],
+        ("differ: ground asphalt", "the source of physics/textures is not the shipped one"),
+    ),
+    "crash": (
+        lambda g: with_trace(g, "curve-001", lambda _: "SUMO failed while starting"),
+        ["curve-001"],
+        ("cannot be run: SUMO failed while starting",),
+    ),
+}
+
+
+@pytest.mark.parametrize("plant, names, words", PLANTED.values(), ids=PLANTED)
+def test_what_is_planted_is_named_with_its_remedy(
+    shipped: Given, plant: Callable[[Given], Given], names: list[str], words: tuple[str, ...]
+) -> None:
+    """Nothing else differs, and the words say which engine, version or part it is."""
+    found, said = told(shipped, plant(shipped))
+    assert found == names
+    for word in words:
+        assert word in said
+
+
+def picture(level: int) -> Frame:
+    labels = np.zeros((96, 96), np.uint8)
+    labels[48:] = 1
+    return Frame(np.full((96, 96, 3), level, np.uint8), labels)
+
+
+@pytest.mark.parametrize(
+    "level, driver, fine",
+    [(100, "shipped", True), (101, "shipped", False), (103, "another", True), (140, "another", False)],
+    ids=["same", "same driver, a level off", "another driver, three levels off", "another driver, forty levels off"],
+)
+def test_pictures_may_differ_a_little_where_another_driver_draws(
+    shipped: Given, level: int, driver: str, fine: bool
+) -> None:
+    """Where the shipped driver draws they are the same to the bit."""
+
+    def with_picture(given: Given, level: int) -> Given:
+        one = kept_picture(picture(level))
+        return with_trace(given, "curve-001", lambda t: replace(t, pictures=t.pictures | {"gl": one}))
+
+    before, after = with_picture(shipped, 100), with_picture(shipped, level)
+    if driver == "another":
+        after = replace(after, alone=after.alone | {DRIVER: "0"}, renderer="gl: other")
+    found, said = told(before, after)
+    assert found == ([] if fine else ["curve-001"])
+    assert fine or "its picture by gl is not: 100.00 % of the labels" in said
+
+
+def test_a_changed_texture_is_named(monkeypatch: pytest.MonkeyPatch, shipped: Given) -> None:
+    """One texel of one texture: that texture and no other."""
+    stack = engines.ground_layers(256)
+    spoiled = stack.rgba.copy()
+    spoiled[stack.index("asphalt"), 3, 5, 0] ^= 1
+    layers = type(stack)(stack.names, spoiled, stack.metres, stack.mean, stack.finish)
+
+    def ground_layers(size_px: int) -> Any:
+        return layers
+
+    before = textures()
+    monkeypatch.setattr(engines, "_STACKS", (ground_layers, *engines._STACKS[1:]))
+    assert before == shipped.textures
+    assert {name for name, told in textures().items() if before[name] != told} == {"ground asphalt"}
+
+
+def test_an_edited_source_is_told_by_its_room(tmp_path: Path) -> None:
+    """In a copy of the tree one constant is another one: the hash of its room is, and no other."""
+    for room in ROOMS:
+        shutil.copytree(ROOT / room, tmp_path / room, ignore=shutil.ignore_patterns("__pycache__", "*.json"))
+    before = room_hashes(tmp_path)
+    edited = tmp_path / "sumo_nets" / "crowd" / "pose_filter.py"
+    edited.write_text(edited.read_text().replace("MAX_SPEED_MPS = 2.2", "MAX_SPEED_MPS = 2.1"))
+    after = room_hashes(tmp_path)
+    assert before == room_hashes(ROOT)
+    assert {room for room in before if before[room] != after[room]} == {"sumo_nets/crowd"}
+
+
+@pytest.mark.parametrize("content", [b"", b"{}", b'{"schema": 1'], ids=["empty", "of nothing", "cut short"])
+def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
+    """In one line, with the remedy."""
+    (tmp_path / "verify.json").write_bytes(content)
+    with pytest.raises(RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install anew$"):
+        Given.load(tmp_path / "verify.json")
+
+
+def test_a_case_that_there_is_not_is_refused(cosim: Cosim) -> None:
+    """With the valid names."""
+    said = cosim("verify", "--case", "frontal-01")
+    assert said.returncode == 2 and "Did you mean frontal-001?" in said.stderr
+
+
+@pytest.mark.engine
+def test_this_installation_is_verified(cosim: Cosim) -> None:
+    """By one case of each suite: engines alone, textures, bits, numbers, pictures."""
+    names = ("crosswalk-001", "lateral-001", "lh-001-00")
+    said = cosim("verify", "--jobs", "1", *(word for name in names for word in ("--case", name)))
+    assert said.returncode == 0, said.stdout + said.stderr
+    for name in ("SUMO alone", "PyBullet alone", "TinyRenderer alone", *names):
+        assert f"ok      {name}: " in said.stdout
+    assert "This installation gives the shipped bits and numbers." in said.stdout
+
+
+@pytest.mark.engine
+def test_a_changed_constant_of_the_crowd_is_found(monkeypatch: pytest.MonkeyPatch, shipped: Given) -> None:
+    """The crowd differs first, before all that hangs on it."""
+    (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
+    monkeypatch.setattr(pose_filter, "MAX_SPEED_MPS", 2.0)
+    trace, told = traced(replace(case, time_limit_s=1.0)), shipped.traces[case.id]
+    assert isinstance(told, Trace) and first_difference(told, trace) == ("crowd", 7)
