@@ -20,7 +20,7 @@ SUITES: Mapping[str, Path] = MappingProxyType({name: path for name, path in _FIL
 
 
 def load_suite(name: str) -> Suite:
-    """A shipped suite by name, or one of the user's by the path of its .json file.
+    """A shipped suite by name, or one of the user's by the path of its .json file, or of an own scenario's .toml.
 
     Raises UsageError with the valid names, SpecError naming the file and the field.
 
@@ -29,9 +29,23 @@ def load_suite(name: str) -> Suite:
     """
     if name.endswith(".json"):
         return read_suite(Path(name), EVENT_KINDS)
+    if name.endswith(".toml"):
+        return _own(Path(name))
     if name not in SUITES:
-        raise unknown("suite", name, [*SUITES, "path/to/suite.json"])
+        raise unknown("suite", name, [*SUITES, "path/to/suite.json", "path/to/own.toml"])
     return read_suite(SUITES[name], EVENT_KINDS)
+
+
+def _own(path: Path) -> Suite:
+    from scenarios.own.making import suite_of_own
+    from scenarios.own.reading import read_own
+
+    own = read_own(path)
+    for goal in filter(None, dict.fromkeys(variant.own.goal_protocol for variant in own.variants)):
+        raise UsageError(
+            f"{path}: goal_protocol '{goal}' is of a run: use `cosim scenario run {path}`, or give --goal in its place"
+        )
+    return suite_of_own(own)
 
 
 def holding(scenario_id: str) -> Suite:

@@ -1,8 +1,10 @@
-"""The command line of own scenarios: `cosim scenario new`, `check`, `draw`."""
+"""The command line of own scenarios: `cosim scenario new`, `check`, `draw`, `run`."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,12 +12,26 @@ import typer
 from rich import box
 from rich.table import Column, Table
 
+from cosim.cli.board import Board
 from cosim.cli.consoles import err, out
+from cosim.cli.eyes import CAMERA_HELP, Choice, camera_here
 from cosim.cli.progress import doing
-from cosim.core.errors import WRONG_USE, SpecError, UsageError, unknown, unwritable
+from cosim.core.errors import (
+    INTERRUPTED,
+    SOME_CRASHED,
+    WRONG_USE,
+    MachineError,
+    SpecError,
+    UsageError,
+    unknown,
+    unwritable,
+)
 from cosim.core.whole_file import write_whole
 
 if TYPE_CHECKING:
+    import pandas as pd
+
+    from cosim.spec.goal import GoalProtocol
     from cosim.spec.scenario import Suite
     from scenarios.own.reading import OwnFile
 
@@ -108,6 +124,114 @@ def draw_own(
     out.print(f"Picture: {picture}", soft_wrap=True)
 
 
+@scenario_app.command(
+    "run",
+    epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
+    "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
+    "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`",
+)
+def run_own(
+    file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
+    policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/NAME-POLICY-TIME.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the run: policies' own seeds are drawn from it.")] = None,
+    frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
+    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+) -> None:
+    """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values, and draw it.
+
+    All other options of runs go with `cosim run FILE.toml`.
+    """
+    from cosim.policies.load import load_policy
+    from cosim.records.run_folder import read_records
+    from cosim.spec.options import EpisodeOptions
+    from scenarios.execution.suite_run import run
+    from scenarios.own.checking import checked_own
+    from scenarios.own.reading import read_own
+
+    if resume and folder is None:
+        raise UsageError("--resume needs --out: the folder of the run to finish")
+    own = read_own(file)
+    with doing(f"checking {file}") as tell:
+        suite = checked_own(own, tell)
+    manifest = load_policy(policy).manifest
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    path = folder or Path("runs") / f"{own.name}-{manifest.name}-{stamp}"
+    by_goal: dict[GoalProtocol | None, list[str]] = {}
+    for variant in own.variants:
+        by_goal.setdefault(variant.own.goal_protocol, []).append(variant.id)
+    _say(own)
+    tables = []
+    for goal, ids in by_goal.items():
+        # A run tells its policies of the goal in one way: a sweep over these is as many runs.
+        part = path if len(by_goal) == 1 else path / str(goal)
+        begun = resume and (part / "run.json").exists()
+        done = {record.scenario for record in read_records(part)} if begun else set()
+        board = Board([one for one in suite.scenarios if one.id in ids], done)
+        options = EpisodeOptions(
+            seed=seed, goal=goal, frames_every_s=frames, camera=camera_here(camera) if manifest.camera else "bullet"
+        )
+        try:
+            with board.bars:
+                again = begun or (resume and len(by_goal) == 1)
+                table = run(
+                    suite, policy, scenarios=ids, jobs=jobs, out=part, resume=again, options=options, tell=board.tell
+                )
+        except KeyboardInterrupt:
+            err.print(f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume", soft_wrap=True)
+            raise typer.Exit(INTERRUPTED) from None
+        tables.append(table)
+    _print_run(own, tables, path)
+
+
+def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:
+    """What came out of a run; of a sweep by its values, which are written beside it."""
+    import pandas as pd
+
+    from cosim.cli.tables import print_statuses, print_table
+    from scenarios.own.sweep import summary_of_sweep, write_sweep
+
+    table = pd.concat(tables, ignore_index=True)
+    if own.axes:
+        summary = summary_of_sweep(own, table)
+        _print_sweep(summary, [axis.field for axis in own.axes])
+        print_statuses(out, table, len(own.variants))
+        try:
+            files = write_sweep(summary, own, path)
+            out.print(f"Table and picture: {' '.join(map(str, files))}", soft_wrap=True)
+        except MachineError as error:
+            err.print(str(error), soft_wrap=True, markup=False, highlight=False)
+    else:
+        print_table(out, table, len(own.variants))
+    out.print(f"Run folder: {path}", soft_wrap=True)
+    if table["ended"].isna().any():
+        raise typer.Exit(SOME_CRASHED)
+
+
+def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
+    """A row for each value: means, with their intervals below."""
+    from scenarios.own.sweep import SWEPT
+
+    columns = [Column(field.replace(".", ".\n"), overflow="fold") for field in fields]
+    columns += [Column("n", justify="right"), *(Column(head, no_wrap=True) for head in ("SR", "SPL", "RC", "FC /100m"))]
+    shown = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for values, rows in summary.groupby(fields, sort=False):
+        means = rows.set_index("metric").loc[list(SWEPT)]
+        cells = [
+            "-" if row["n"] == 0 else f"{row['mean']:.2f}\n{row['low']:.2f}..{row['high']:.2f}"
+            for _, row in means.iterrows()
+        ]
+        scored = f"{means['n'].max():.0f}"
+        shown.add_row(*(f"{value}" for value in values), scored, *cells)
+    out.print(shown)
+    out.print(
+        "n episodes that are scored; SR success: the goal reached in time without a failure; SPL the same by path "
+        "length; RC share of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
+    )
+
+
 def _say(own: OwnFile) -> None:
     """What a file makes, in words."""
     swept = ", ".join(f"{axis.field} ({len(axis.values)} values)" for axis in own.axes)
@@ -119,6 +243,7 @@ def _say(own: OwnFile) -> None:
 def _print_scenarios(suite: Suite, own: OwnFile) -> None:
     """A row per scenario, with its hash: for 80 columns."""
     from cosim.spec.scenario import content_hash
+    from scenarios.own.along import narrow_events
     from scenarios.own.ways import moved_m
 
     heads = ("scenario", "hash", "way\nm", "cross-\nings", "events", "obst-\nacles", "people", "limit\ns")
@@ -134,4 +259,6 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
     for name, far_m in dict.fromkeys(end for variant, one in pairs for end in moved_m(variant.own.way, one)):
         if far_m > _MOVED_M:
             out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
+    for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
+        out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
     out.print(f"on {', '.join(sorted({one.place.name for one in suite.scenarios}))}; suite hash {suite.content_hash}")

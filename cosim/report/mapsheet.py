@@ -10,6 +10,7 @@ import numpy as np
 import shapely
 
 from cosim.core.errors import unwritable
+from cosim.core.whole_file import write_whole
 from cosim.place.map_check import MapCheck
 from cosim.place.street_map import StreetMap, Strip
 from cosim.report.above import TRACK, Sheet, draw_streets
@@ -55,7 +56,7 @@ def write_png(image: Image, path: Path) -> None:
     """Write an RGB picture. Raises MachineError when the folder cannot be written."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
+        write_whole(path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())
     except OSError as error:
         raise unwritable(path, error) from error
 

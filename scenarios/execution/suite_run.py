@@ -28,11 +28,15 @@ from physics.cameras.choice import renderer_of
 from physics.robots import hash_of_robot
 from scenarios.builders.fits import check_places
 from scenarios.catalog import load_suite, scenarios_chosen, with_robot
-from scenarios.execution.messages import Hello
+from scenarios.execution.messages import Hear, Hello
 from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
 from scenarios.execution.transport import InProcess, Transport
 from scenarios.rendering.shared import SharedRenderer, check_shared
+
+
+def _untold(message: object) -> None:
+    """Nobody wants to know."""
 
 
 def run(
@@ -47,6 +51,7 @@ def run(
     resume: bool = False,
     shared_renderer: bool = False,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
+    tell: Hear = _untold,
 ) -> pd.DataFrame:
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
 
@@ -55,7 +60,8 @@ def run(
     survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
     out: the run folder, to be kept and resumed; without one only the table is. shared_renderer: one process draws for
     all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`). options: without a seed one is drawn
-    anew, or taken from the run that is resumed; it stands in every row (`run_seed`).
+    anew, or taken from the run that is resumed; it stands in every row (`run_seed`). tell: takes in what workers say of
+    their episodes.
 
     Raises UsageError for names and options that do not exist, SpecError for scenarios that do not fit their places,
     RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
@@ -93,7 +99,7 @@ def run(
         renderer = None
         if shared_renderer and todo:
             renderer = stack.enter_context(SharedRenderer(held.path / "logs", hello, asks=asks))
-        run_all(held, todo, hello, transport, jobs=jobs, tell=_untold, options=options, renderer=renderer)
+        run_all(held, todo, hello, transport, jobs=jobs, tell=tell, options=options, renderer=renderer)
         return held.finish()
 
 
@@ -165,7 +171,3 @@ def _settled(options: EpisodeOptions, whole: Suite, driver: Driver, seed: int) -
     """Options with the run's seed, the suite's hash and the one camera of the run."""
     camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
     return msgspec.structs.replace(options, seed=seed, suite_hash=whole.content_hash, camera=camera)
-
-
-def _untold(message: object) -> None:
-    """Nobody wants to know."""

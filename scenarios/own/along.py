@@ -3,24 +3,27 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import numpy as np
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline, Pose
+from cosim.core.state import PERSON_RADIUS_M
 from cosim.place.street_map import StreetMap
 from cosim.spec.event_kind import EventKind
 from cosim.spec.events import Event
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.robot import Robot
+from cosim.spec.robot import Robot, robot_called
 from cosim.spec.scenario import Scenario
 from scenarios.builders.drawing import wider_m
 from scenarios.builders.way_events import crosswalk_spots, is_straight_between
 from scenarios.events import EVENT_KINDS
 from scenarios.own.format import OwnEvent, OwnObstacle
 
+_NARROW_M: Final = 0.25
+"""A sidewalk with so much more to either side than the robot and a person take has room for one who stands there."""
 _LOOK_EVERY_M: Final = 0.5
 _BEYOND_M: Final = 5.0
 """So far past its place the way of an event is straight, if it does not end before."""
@@ -64,6 +67,19 @@ def event_along(number: int, asked: OwnEvent, scenario: Scenario, street_map: St
     )
 
 
+def narrow_events(scenario: Scenario) -> Iterator[str]:
+    """Events on sidewalks narrower than those of the suites: they take place, but may leave no room to pass."""
+    robot = robot_called(scenario.robot)
+    for event in scenario.events:
+        layout = EVENT_KINDS[event.kind].layout
+        usual_m = 0.0 if layout is None else 2.0 * (layout.half_width_m + wider_m(robot))
+        if 2.0 * event.half_width_m < usual_m:
+            yield (
+                f"'{event.kind}' at {event.route_s_m:.1f} m: the sidewalk is {2 * event.half_width_m:.1f} m wide, "
+                f"in the suites {usual_m:.1f} m or more: there may be no room to pass"
+            )
+
+
 def obstacle_along(asked: OwnObstacle, route: Polyline) -> Obstacle:
     """The thing that a file asks for, beside the route. Raises SpecError where the way is not so long."""
     if asked.at_m > route.length_m:
@@ -100,6 +116,8 @@ def _misfit(kind: EventKind, at_m: float, route: Polyline, street_map: StreetMap
     if at_m > route.length_m + _BEYOND_M:
         return f"the way ends at {route.length_m:.1f} m"
     half_m, needed_m = _half_width_m(route, at_m, street_map), layout.half_width_m + wider_m(robot)
+    if not kind.passed_round:
+        needed_m = min(needed_m, robot.width_m / 2 + PERSON_RADIUS_M + _NARROW_M)
     if half_m <= 0.0:
         return "no sidewalk is there, but a corner or a crossing"
     if half_m < needed_m:

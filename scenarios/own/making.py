@@ -70,6 +70,8 @@ def place_of_own(own: OwnPlace) -> Place:
     if own.map:
         return CityMap(map=own.map, roughness=own.roughness)
     path = Path(own.file)
+    if not path.exists():
+        raise SpecError(f"place.file: there is no {path}: give its path from the folder of this file")
     if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
         return CityMap(map=imported_place(path), roughness=own.roughness)
     return place_called(own.file, own.roughness)

@@ -1,0 +1,86 @@
+"""Curves of a sweep: a panel for each metric, the first field along it, a line for each value of the others."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+
+from cosim.core.errors import MachineError
+
+_TITLES: Final = {
+    "success": "success (SR)",
+    "spl": "success by path length (SPL)",
+    "route_completion": "share of the route done (RC)",
+    "failures_per_100m": "failures per 100 m, pooled (FC)",
+    "pedestrian_distance_min_m": "nearest to a person's centre, m",
+    "time_to_goal_s": "time to the goal, s",
+}
+_SHARES: Final = ("success", "spl", "route_completion")
+_COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#555555", "#882255")
+_MARKS: Final = "osD^v<>P"
+_MOST_NAMED: Final = 16
+"""Of more lines than this none is named."""
+_APART: Final = 0.012
+"""Lines stand so far beside each other, of the width of a panel, so that their intervals can be told apart."""
+
+
+def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[str], title: str) -> bytes:
+    """A PNG of the means with their intervals. summary: rows of fields, metric, mean, low, high, n. Raises MachineError
+    where the library that draws is not installed."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise MachineError(
+            "no picture of the sweep: matplotlib is missing: `pip install matplotlib`, then the same with --resume"
+        ) from error
+    first, *others = fields
+    along, ticks = _places(summary[first])
+    whole = summary.assign(_along=along)
+    lines = list(whole.groupby(others, sort=False)) if others else [((), whole)]
+    figure = Figure(figsize=(13.0, 7.4), dpi=120, layout="constrained")
+    FigureCanvasAgg(figure)
+    for panel, metric in zip(figure.subplots(2, -(-len(metrics) // 2)).flat, metrics, strict=True):
+        shift = _APART * (float(np.ptp(along)) or 1.0)
+        for number, (values, rows) in enumerate(lines):
+            colour, mark = _COLOURS[number % len(_COLOURS)], _MARKS[number % len(_MARKS)]
+            here = rows[(rows["metric"] == metric) & rows["mean"].notna()]
+            at = here["_along"] + shift * (number - (len(lines) - 1) / 2)
+            ends = [here["mean"] - here["low"], here["high"] - here["mean"]]
+            named = _named(others, values)
+            panel.errorbar(at, here["mean"], ends, color=colour, marker=mark, capsize=3, lw=1.6, ms=5, label=named)
+        panel.set_title(_TITLES.get(metric, metric), fontsize=11)
+        panel.set_xlabel(first)
+        panel.grid(alpha=0.3)
+        if ticks is not None:
+            panel.set_xticks(range(len(ticks)), ticks)
+        if metric in _SHARES:
+            panel.set_ylim(-0.03, 1.03)
+        else:
+            panel.set_ylim(bottom=0.0)
+    if others and len(lines) <= _MOST_NAMED:
+        handles, names = figure.axes[0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4), fontsize=9)
+    figure.suptitle(f"{title}: means with 95 % intervals", fontsize=12)
+    picture = io.BytesIO()
+    figure.savefig(picture, format="png")
+    return picture.getvalue()
+
+
+def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:
+    """Where values stand along a panel: numbers where they are, words one after the other, with their names."""
+    numbers = pd.to_numeric(values, errors="coerce")
+    if numbers.notna().all() and not values.map(lambda value: isinstance(value, bool)).any():
+        return numbers.to_numpy(dtype=float), None
+    names = list(dict.fromkeys(map(str, values)))
+    return np.array([names.index(str(value)) for value in values], dtype=float), names
+
+
+def _named(fields: Sequence[str], values: Any) -> str:
+    """What a line is of."""
+    values = values if isinstance(values, tuple) else (values,)
+    return ", ".join(f"{field} {value}" for field, value in zip(fields, values, strict=True))

@@ -1,0 +1,133 @@
+"""Own scenarios that are run: the examples that ship, and sweeps, from a list in a file to a table and a picture."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from cosim.core.errors import MachineError
+from cosim.judge.metrics import METRICS
+from cosim.records.results import summary_of
+from scenarios.own.reading import OwnFile, read_own
+from scenarios.own.sweep import summary_of_sweep, write_sweep
+from tests.conftest import ROOT, Cosim
+
+EXAMPLES = ROOT / "scenarios" / "examples"
+SHORTER = {
+    "seeds = 3 ": "seeds = 1 ",
+    "[0, 5, 10, 20]": "[0, 20]",
+    "time_s = 120": "time_s = 2",
+    "time_s = 180": "time_s = 2",
+}
+
+
+@pytest.fixture
+def swept() -> tuple[OwnFile, pd.DataFrame]:
+    """A sweep over density and goal, and what could have come of it: at a density of 20 every second one fails."""
+    own = read_own(EXAMPLES / "density-sweep.toml")
+    table = pd.DataFrame(index=range(len(own.variants)), columns=["scenario", "status", *METRICS], dtype=object)
+    table["scenario"], table["status"] = [variant.id for variant in own.variants], "done"
+    dense = np.array([variant.at["crowd.density"] == 20 for variant in own.variants])
+    failed = dense & (np.arange(len(dense)) % 2 == 0)
+    table["success"], table["failures"], table["path_length_m"] = 1.0 - failed, 1.0 * failed, 40.0
+    return own, table
+
+
+def test_a_sweep_gives_what_the_summary_of_a_run_gives_for_each_value(swept: tuple[OwnFile, pd.DataFrame]) -> None:
+    """Means, pooled rates and intervals of the episodes of one value, as of a run of these alone."""
+    own, table = swept
+    summary = summary_of_sweep(own, table).set_index(["crowd.density", "metric"])
+    assert list(dict.fromkeys(summary.index.get_level_values(0))) == [0, 5, 10, 20]
+    for density in (0, 20):
+        ids = [variant.id for variant in own.variants if variant.at["crowd.density"] == density]
+        alone = summary_of(table[table["scenario"].isin(ids)])
+        pd.testing.assert_frame_equal(summary.loc[density][["mean", "low", "high", "n"]], alone, check_dtype=False)
+    assert summary.loc[(0, "success"), "mean"] == 1.0 and 0.0 < summary.loc[(20, "success"), "mean"] < 1.0
+    rate = summary.loc[(20, "failures_per_100m")]
+    assert rate["mean"] == pytest.approx(100.0 * table["failures"].sum() / 120.0) and rate["n"] == 3
+
+
+def test_a_sweep_is_written_whole_or_not_at_all(
+    swept: tuple[OwnFile, pd.DataFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A table of every metric and a picture; without the library that draws only the table; nothing without a place."""
+    own, table = swept
+    summary = summary_of_sweep(own, table)
+    assert [path.name for path in write_sweep(summary, own, tmp_path)] == ["sweep.csv", "sweep.png"]
+    read = pd.read_csv(tmp_path / "sweep.csv")
+    assert set(read["metric"]) == set(METRICS) and list(read.columns)[:3] == ["crowd.density", "episodes", "invalid"]
+    assert (tmp_path / "sweep.png").read_bytes().startswith(b"\x89PNG")
+    with pytest.raises(MachineError, match=r"nowhere.sweep.csv: cannot be written"):
+        write_sweep(summary, own, tmp_path / "nowhere")
+    (tmp_path / "bare").mkdir()
+    monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
+    with pytest.raises(MachineError, match="matplotlib is missing: `pip install matplotlib`"):
+        write_sweep(summary, own, tmp_path / "bare")
+    assert [path.name for path in (tmp_path / "bare").iterdir()] == ["sweep.csv"]
+
+
+def test_words_and_several_fields_are_drawn(tmp_path: Path) -> None:
+    """What is no number stands along the picture by its name, further fields are lines."""
+    text = (EXAMPLES / "density-sweep.toml").read_text()
+    path = tmp_path / "own.toml"
+    path.write_text('robot = ["courier", "scout"]\n' + text)
+    own = read_own(path)
+    table = pd.DataFrame({"scenario": [one.id for one in own.variants], "status": "done"})
+    summary = summary_of_sweep(own, table.reindex(columns=["scenario", "status", *METRICS]))
+    assert list(summary.columns)[:2] == ["robot", "crowd.density"] and summary["robot"].nunique() == 2
+    assert len(write_sweep(summary, own, tmp_path)) == 2
+
+
+@pytest.fixture(scope="module")
+def examples(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The examples in a folder of their own, shortened to what a test can wait for."""
+    folder = tmp_path_factory.mktemp("own") / "examples"
+    shutil.copytree(EXAMPLES, folder)
+    for path in folder.glob("*.toml"):
+        text = path.read_text()
+        for long, short in SHORTER.items():
+            text = text.replace(long, short)
+        path.write_text(text)
+    return folder
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", ["morning-crossing", "own-map"])
+def test_an_example_is_sound_and_runs(examples: Path, name: str, cosim: Cosim) -> None:
+    """A crossing with a crowd, an event on a map of one's own; the row holds the hash that `check` tells."""
+    done = cosim("scenario", "check", f"{name}.toml", cwd=examples)
+    assert done.returncode == 0, done.stderr
+    ran = cosim("scenario", "run", f"{name}.toml", "--policy", "straight", "--out", name, cwd=examples)
+    assert ran.returncode == 0 and f"Run folder: {name}" in ran.stdout, ran.stderr
+    row = pd.read_csv(examples / name / "results.csv").iloc[0]
+    assert row["suite"] == row["scenario"] == name and row["scenario_hash"] in done.stdout
+    assert row["status"] == "done"
+    assert cosim("show", name, cwd=examples).returncode == 0
+
+
+@pytest.mark.engine
+def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
+    """From a file to a table by density, and files beside the run; it is resumed, but not once the file is edited."""
+    words = ("scenario", "run", "density-sweep.toml", "--policy", "straight", "--out", "swept")
+    ran = cosim(*words, cwd=examples)
+    assert ran.returncode == 0, ran.stderr
+    head, *_ = (line for line in ran.stdout.splitlines() if "SR" in line)
+    assert head.split() == ["density", "n", "SR", "SPL", "RC", "FC", "/100m"]
+    assert {"run.json", "results.csv", "sweep.csv", "sweep.png"} <= {
+        path.name for path in (examples / "swept").iterdir()
+    }
+    assert pd.read_csv(examples / "swept" / "sweep.csv")["crowd.density"].unique().tolist() == [0, 20]
+    scored = cosim("score", "swept", cwd=examples)
+    assert scored.returncode == 0 and "equal to the bit" in scored.stdout, scored.stderr
+    (examples / "swept" / "sweep.png").unlink()
+    again = cosim(*words, "--resume", cwd=examples)
+    assert again.returncode == 0 and (examples / "swept" / "sweep.png").exists(), again.stderr
+    path = examples / "density-sweep.toml"
+    path.write_text(path.read_text().replace("[0, 20]", "[0, 25]"))
+    other = cosim(*words, "--resume", cwd=examples)
+    assert other.returncode == 2 and "is of another run" in other.stderr
