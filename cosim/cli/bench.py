@@ -13,6 +13,7 @@ from rich.table import Column, Table
 
 from cosim.cli.consoles import out
 from cosim.cli.crowd import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, bench_crossings, bench_crowd
+from cosim.cli.people import bench_people
 from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unknown
 
@@ -28,7 +29,8 @@ def bench(
         typer.Argument(
             metavar="WHAT",
             help="environment (one process, part by part), camera (all of them side by side), crowd (how people and "
-            "vehicles behave) or crossings (how a policy, they and the lights get on).",
+            "vehicles behave), people (how the crowd walks, beside what was measured of people) or crossings (how a "
+            "policy, they and the lights get on).",
         ),
     ] = "environment",
     only: Annotated[
@@ -50,13 +52,13 @@ def bench(
     residents: Annotated[int, typer.Option(min=0, help="For `crowd`: residents beside the crowd.")] = 0,
     crossings: Annotated[int, typer.Option(min=1, help="For `crossings`: how many in all.")] = 200,
     policy: Annotated[str, typer.Option(help="For `crossings`: who drives over them.")] = "orca",
-    jobs: Annotated[int, typer.Option(min=1, help="For `crossings`: environment processes.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="For `crossings` and `people`: processes.")] = 1,
     groups: Annotated[float, typer.Option(help=f"For `crowd`: {GROUPS_HELP}")] = 0.0,
     elderly: Annotated[float, typer.Option(help=f"For `crowd`: {ELDERLY_HELP}")] = 0.0,
     children: Annotated[float, typer.Option(help=f"For `crowd`: {CHILDREN_HELP}")] = 0.0,
 ) -> None:
     """Measure one environment process, part by part, the cameras, or what robot, people and vehicles do in traffic."""
-    choices = ("environment", "camera", "crowd", "crossings")
+    choices = ("environment", "camera", "crowd", "people", "crossings")
     if what not in choices:
         raise unknown("bench", what, choices)
     if what == "crowd":
@@ -64,6 +66,9 @@ def bench(
         return
     if what == "crossings":
         bench_crossings(crossings, min(20, crossings) if cities is None else cities, policy, jobs)
+        return
+    if what == "people":
+        bench_people(jobs)
         return
     only = only or []
     if compare is not None:

@@ -1,0 +1,1 @@
+"""`cosim bench people`: how the crowd walks, beside what was measured of people."""
