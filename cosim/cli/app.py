@@ -16,6 +16,7 @@ from rich.markup import escape
 from cosim.cli.bench import bench
 from cosim.cli.board import Board
 from cosim.cli.city import city_app
+from cosim.cli.compare import compare
 from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, CROWD_HELP, ELDERLY_HELP, GROUPS_HELP, VEHICLES_SHARE, compare_one
 from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, ROBOT_HELP, Choice, camera_here, export, film, look
@@ -356,6 +357,11 @@ app.command(
     "`cosim bench crossings --crossings 40 --jobs 2 --policy orca`",
 )(bench)
 app.command(rich_help_panel=TRUST, epilog="Example:  \n`cosim score runs/mine`")(score)
+app.command(
+    rich_help_panel=TRUST,
+    epilog="Examples:  \n`cosim compare runs/before runs/after`  \n"
+    "`cosim compare runs/straight runs/mine runs/other -o all.csv -o table.md -o table.tex`",
+)(compare)
 app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
 app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)

@@ -1,0 +1,182 @@
+"""Compare runs of one suite, scenario by scenario: what differs, what is within noise, and which scenarios flipped."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from cosim.core.errors import RunError, UsageError
+from cosim.core.geometry import Floats
+from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
+from cosim.records.paired import PairedDifference, difference_of_means, difference_of_rates
+from cosim.records.results import not_to_be_quoted, table_of
+from cosim.records.whole_run import WholeRun, read_whole_run
+from cosim.spec.scenario import Scenario
+
+DIFFERENCES: Final = (
+    "before", "after", "by", "group", "metric", "unit", "n", "value_before", "value_after", "difference", "low", "high",
+    "changed", "verdict",
+)  # fmt: skip
+FLIPPED: Final = ("before", "after", "scenario", "split", "structure", "flip", "ended_before", "ended_after")
+
+Groups = Mapping[tuple[str, str], frozenset[str]]
+"""Scenario ids by what they have in common: ("suite" | "event" | "structure" | "split", its name)."""
+
+
+class ComparedRun(NamedTuple):
+    """label: what it is called in tables; table: a row per episode, as in results.csv."""
+
+    label: str
+    path: Path
+    table: pd.DataFrame
+
+
+class Comparison(NamedTuple):
+    """before: the run that the others are compared with. differences, flipped: a row each, `DIFFERENCES`, `FLIPPED`.
+    notes: what a reader of these must know."""
+
+    suite: str
+    before: ComparedRun
+    others: tuple[ComparedRun, ...]
+    differences: pd.DataFrame
+    flipped: pd.DataFrame
+    notes: tuple[str, ...]
+
+
+def compare_runs(paths: Sequence[Path]) -> Comparison:
+    """The first run with each of the others. Raises UsageError for fewer than two, what `read_whole_run` raises, and
+    RunError, naming folder and remedy, for runs that are of different suites, or share no scenario."""
+    if len(paths) < 2:
+        raise UsageError("a comparison needs two runs or more: cosim compare RUN OTHER ...")
+    runs = [read_whole_run(path) for path in paths]
+    for run in runs:
+        _check_suites(runs[0], run)
+    before, *others = (
+        ComparedRun(label, run.path, table_of(run.records.values()))
+        for label, run in zip(_labels(runs), runs, strict=True)
+    )
+    groups = groups_of(runs[0].spec.suite, runs[0].scenarios.values())
+    pairs = [(before, other) for other in others]
+    differences = pd.concat([differences_of(*pair, groups) for pair in pairs], ignore_index=True)
+    flipped = pd.concat([flipped_between(*pair) for pair in pairs], ignore_index=True)
+    notes = (*_notes(runs, [before, *others]), *_lonely(pairs))
+    return Comparison(runs[0].spec.suite, before, tuple(others), differences, flipped, notes)
+
+
+def groups_of(suite: str, scenarios: Iterable[Scenario]) -> dict[tuple[str, str], frozenset[str]]:
+    """The whole suite, and by event (who has it on the way), structure and split; none that is the same as another."""
+    members: dict[tuple[str, str], set[str]] = {}
+    for one in scenarios:
+        kinds = dict.fromkeys(event.kind for event in one.events)
+        named = [("suite", suite), *(("event", kind) for kind in kinds)]
+        for key in [*named, ("structure", one.structure), ("split", one.split)]:
+            members.setdefault(key, set()).add(one.id)
+    order = ("suite", "event", "structure", "split")
+    found: dict[tuple[str, str], frozenset[str]] = {}
+    for key in sorted(members, key=lambda key: order.index(key[0])):
+        if key[1] and frozenset(members[key]) not in found.values():
+            found[key] = frozenset(members[key])
+    return found
+
+
+def differences_of(before: ComparedRun, after: ComparedRun, groups: Groups, names: Sequence[str] = ()) -> pd.DataFrame:
+    """A row for each group and metric, `DIFFERENCES`: over the scenarios that both runs have. names: of metrics; all
+    that both have where none is named."""
+    one, other = (run.table.set_index("scenario") for run in (before, after))
+    ids = [name for name in one.index if name in other.index]
+    names = names or [name for name in (*METRICS, *COUNTERFACTUAL) if name in one.columns and name in other.columns]
+    rows = []
+    for (by, group), members in groups.items():
+        inside = [name for name in ids if name in members]
+        if not inside:
+            continue
+        pair = one.loc[inside], other.loc[inside]
+        for name in names:
+            found = _difference(name, *pair)
+            unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
+            values = (found.n, found.before, found.after, found.difference, found.low, found.high, found.changed)
+            verdict = found.verdict(better) if found.n else ""
+            rows.append((before.label, after.label, by, group, name, unit, *values, verdict))
+    return pd.DataFrame(rows, columns=list(DIFFERENCES))
+
+
+def _difference(name: str, before: pd.DataFrame, after: pd.DataFrame) -> PairedDifference:
+    """Of a metric, over rows of the same scenarios. A rate has none where a policy crashed: what it would have done
+    after that cannot be counted."""
+    if name not in POOLED:
+        return difference_of_means(_column(before, name), _column(after, name))
+    if "crashed" in {*before["status"], *after["status"]}:
+        return PairedDifference(math.nan, math.nan, math.nan, math.nan, 0, 0)
+    counted, metres = POOLED[name]
+    one, other = ((_column(table, counted), _column(table, metres)) for table in (before, after))
+    return difference_of_rates(one, other)
+
+
+def flipped_between(before: ComparedRun, after: ComparedRun) -> pd.DataFrame:
+    """A row for each scenario that one run solved and the other did not, `FLIPPED`: "won" by the second, or "lost"."""
+    one, other = (run.table.set_index("scenario") for run in (before, after))
+    rows = []
+    for name in one.index.intersection(other.index):
+        mine, theirs = one.loc[name], other.loc[name]
+        if pd.notna(mine["success"]) and pd.notna(theirs["success"]) and mine["success"] != theirs["success"]:
+            flip = "won" if theirs["success"] > mine["success"] else "lost"
+            ends = (str(row["ended"] if row["status"] == "done" else row["status"]) for row in (mine, theirs))
+            rows.append((before.label, after.label, name, mine["split"], mine["structure"], flip, *ends))
+    return pd.DataFrame(rows, columns=list(FLIPPED))
+
+
+def _column(table: pd.DataFrame, name: str) -> Floats:
+    return np.asarray(pd.to_numeric(table[name], errors="coerce"), dtype=float)
+
+
+def _check_suites(one: WholeRun, other: WholeRun) -> None:
+    """Raises RunError where two runs are not of the same suite, or share no scenario."""
+    mine, theirs = one.spec, other.spec
+    if mine.suite_hash != theirs.suite_hash:
+        what = "the same suite" if mine.suite != theirs.suite else "the same version of it (edited, robot, --crowd?)"
+        raise RunError(
+            f"{other.path} is of suite '{theirs.suite}' {theirs.suite_version} ({theirs.suite_hash}), {one.path} of "
+            f"'{mine.suite}' {mine.suite_version} ({mine.suite_hash}): run both on {what}"
+        )
+    if not one.records.keys() & other.records.keys():
+        raise RunError(
+            f"{other.path} has no scenario that {one.path} has: run both with the same --scenario, --episodes"
+        )
+
+
+def _labels(runs: Sequence[WholeRun]) -> list[str]:
+    """What runs are called: by their policies where these are apart, else by their folders, and numbers."""
+    names = [run.spec.policy_name for run in runs]
+    if len({*names}) < len(names):
+        names = [run.path.absolute().name for run in runs]
+    return [f"{name} ({names[:i].count(name) + 1})" if name in names[:i] else name for i, name in enumerate(names)]
+
+
+def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[str]:
+    """What makes runs unlike in more than their policies, and what is not to be quoted."""
+    for run, one in zip(runs, told, strict=True):
+        if reason := not_to_be_quoted(one.table, len(run.spec.scenarios)):
+            yield f"{one.label} is not to be quoted: {reason}"
+        if odd := next((record.nonstandard for record in run.records.values() if record.nonstandard), ""):
+            yield f"{one.label} is nonstandard: {odd}"
+        crashed = sum(record.status == "crashed" for record in run.records.values())
+        if crashed:
+            yield f"{one.label}: {crashed} crashed, counted as the worst there is; groups with them have no rates"
+        first = runs[0].spec
+        if changed := [n for n, v in first.versions.items() if run.spec.versions.get(n) != v]:
+            apart = ", ".join(f"{n} {first.versions[n]} and {run.spec.versions.get(n)}" for n in changed)
+            yield f"{told[0].label} and {one.label} ran with other versions, a difference may be theirs: {apart}"
+
+
+def _lonely(pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Iterator[str]:
+    """Episodes that no pair has."""
+    for before, after in pairs:
+        mine, theirs = ({*run.table["scenario"]} for run in (before, after))
+        if mine != theirs:
+            alone = f"{len(mine - theirs)} of {before.label}, {len(theirs - mine)} of {after.label}"
+            yield f"scenarios that only one of both runs has are left out: {alone}"

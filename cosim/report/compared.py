@@ -1,0 +1,136 @@
+"""A comparison as tables to be read: rows of words, and these as Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, Final, NamedTuple
+
+import pandas as pd
+
+from cosim.records.comparison import ComparedRun, Comparison
+from cosim.records.paired import FEWEST_CHANGED
+from cosim.records.results import BOOTSTRAP
+
+_OF_THE_SUITE: Final = (
+    "success", "goal_reached", "route_completion", "spl", "failures_per_100m", "collisions_per_100m",
+    "out_of_lane_per_100m", "freezings_per_100m", "failures_per_100m_route", "velocity_mean_mps",
+    "pedestrian_collision", "other_collision", "left_lane", "broke_rule", "red_light_entries",
+    "pedestrian_distance_min_m", "clearance_min_m", "time_to_goal_s",
+)  # fmt: skip
+_OF_GROUPS: Final = {"success": "SR", "route_completion": "RC", "failures_per_100m": "FC"}
+_LATEX: Final = {
+    "\\": r"\textbackslash{}", "{": r"\{", "}": r"\}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "|": r"\textbar{}", '"': r"\textquotedbl{}",
+}  # fmt: skip
+_MARKS: Final = re.compile(r"([\\`*_{}\[\]#|~$&])")
+_SIGNED: Final = re.compile(r"(?<!\S)[-+]\d[\d.]*(?!\S)")
+
+
+class WrittenTable(NamedTuple):
+    """A title, heads of columns, rows of words; names: how many columns are names, the others are figures."""
+
+    title: str
+    heads: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    names: int
+
+
+def tables_of_comparison(told: Comparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
+    """Of the first run and one of the others: the whole suite by metric, and its groups by the most telling metrics.
+    What no pair of episodes has is left out."""
+    told_of = told.differences["after"] == other.label
+    rows = told.differences[told_of & (told.differences["n"] > 0)].to_dict("records")
+    title = f"{other.label} (B) against {told.before.label} (A), suite {told.suite}"
+    figures = ("A", "B", "B - A", "95 % of B - A", "n", "")
+    whole = [row for row in rows if row["by"] == "suite" and row["metric"] in _OF_THE_SUITE]
+    tables = [WrittenTable(title, ("metric", *figures), tuple((row["metric"], *_figures(row)) for row in whole), 1)]
+    if parts := [row for row in rows if row["by"] != "suite" and row["metric"] in _OF_GROUPS]:
+        named = " and ".join(dict.fromkeys(row["by"] for row in parts))
+        each = tuple((row["group"], _OF_GROUPS[row["metric"]], *_figures(row)) for row in parts)
+        tables.append(WrittenTable(f"{title}, by {named}", ("group", "", *figures), each, 2))
+    return tuple(tables)
+
+
+def _figures(row: Mapping[Hashable, Any]) -> tuple[str, ...]:
+    interval = "-" if pd.isna(row["low"]) else f"{_signed(row['low'])} to {_signed(row['high'])}"
+    values = (_plain(row["value_before"]), _plain(row["value_after"]), _signed(row["difference"]))
+    return (*values, interval, f"{row['n']}", row["verdict"])
+
+
+def _plain(value: float) -> str:
+    return f"{value:.2f}" if abs(value) < 100.0 else f"{value:.1f}"
+
+
+def _signed(value: float) -> str:
+    return f"{value + 0.0:+.{3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1}f}"
+
+
+def flips_in_words(told: Comparison, other: ComparedRun) -> tuple[str, ...]:
+    """Which scenarios the other run won, and which it lost, by name."""
+    flipped = told.flipped[told.flipped["after"] == other.label]
+    lines = []
+    for flip, what in (("won", f"solved by {other.label} alone"), ("lost", f"solved by {told.before.label} alone")):
+        names = flipped.loc[flipped["flip"] == flip, "scenario"].tolist()
+        lines.append(f"{what}, {len(names)}: {', '.join(names) or 'none'}")
+    return tuple(lines)
+
+
+def how_to_read(told: Comparison) -> str:
+    """What the figures are, in words."""
+    shown = int((told.differences["n"] > 0).sum())
+    return (
+        f"Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, {BOOTSTRAP} times, always "
+        "the same. Within noise: the interval holds 0. Too few: it does not, but fewer than "
+        f"{FEWEST_CHANGED} scenarios changed. One interval in twenty misses by chance alone: there are {shown}. "
+        "SR success, RC share of the route done, FC failures per 100 m travelled; the scenarios of an event are those "
+        "that have one on their way."
+    )
+
+
+def as_markdown(told: Comparison) -> str:
+    """All of it for a page of Markdown."""
+    blocks = []
+    for other in told.others:
+        for table in tables_of_comparison(told, other):
+            bars = ["---"] * table.names + ["---:"] * (len(table.heads) - table.names)
+            lines = (table.heads, bars, *([_in_markdown(cell) for cell in row] for row in table.rows))
+            rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+            blocks.append(f"**{_in_markdown(table.title)}**\n\n{rows}")
+        blocks.append("\n".join(f"- {_in_markdown(line)}" for line in flips_in_words(told, other)))
+    return "\n\n".join([*blocks, *map(_in_markdown, (*told.notes, how_to_read(told)))]) + "\n"
+
+
+def as_latex(told: Comparison) -> str:
+    """All of it for a paper, to be taken in with \\input; it needs no package."""
+    blocks = []
+    for other in told.others:
+        for table in tables_of_comparison(told, other):
+            columns = "l" * table.names + "r" * (len(table.heads) - table.names - 1) + "l"
+            head, *rows = (" & ".join(map(_in_latex, line)) + r" \\" for line in (table.heads, *table.rows))
+            lines = (
+                r"\begin{table}", r"\centering", rf"\caption{{{_in_latex(table.title)}}}",
+                rf"\begin{{tabular}}{{{columns}}}", r"\hline", head, r"\hline", *rows, r"\hline", r"\end{tabular}",
+                r"\end{table}",
+            )  # fmt: skip
+            blocks.append("\n".join(lines))
+        blocks.append("\n\n".join(map(_in_latex, flips_in_words(told, other))))
+    return "\n\n".join([*blocks, *map(_in_latex, (*told.notes, how_to_read(told)))]) + "\n"
+
+
+def _in_latex(text: str) -> str:
+    plain = "".join(_LATEX.get(letter, letter) for letter in _one_line(text))
+    return _SIGNED.sub(r"$\g<0>$", plain)
+
+
+def _in_markdown(text: str) -> str:
+    return _MARKS.sub(r"\\\1", _one_line(text)).replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+FORMATS: Final[dict[str, Callable[[Comparison], str]]] = {".md": as_markdown, ".tex": as_latex}
+"""By the end of a file's name."""
