@@ -16,7 +16,7 @@ from cosim.cli.progress import doing
 from cosim.core.errors import UsageError, unwritable
 
 if TYPE_CHECKING:
-    from cosim.records.comparison import Comparison
+    from cosim.records.comparison import RunComparison
 
 _OUTPUT_HELP = "Write it too: .csv (all metrics; flipped scenarios go into NAME.flipped.csv), .md, .tex; repeatable."
 
@@ -48,7 +48,7 @@ def compare(
         out.print(f"Written: {path}", soft_wrap=True, markup=False, highlight=False)
 
 
-def print_comparison(out: Console, told: Comparison) -> None:
+def print_comparison(out: Console, told: RunComparison) -> None:
     """What is compared, a table of each run's whole suite and one of its groups, and what flipped: for 80 columns."""
     from cosim.cli.tables import print_terms
     from cosim.report.compared import flips_in_words, how_to_read, tables_of_comparison

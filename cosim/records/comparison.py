@@ -36,7 +36,7 @@ class ComparedRun(NamedTuple):
     table: pd.DataFrame
 
 
-class Comparison(NamedTuple):
+class RunComparison(NamedTuple):
     """before: the run that the others are compared with. differences, flipped: a row each, `DIFFERENCES`, `FLIPPED`.
     notes: what a reader of these must know."""
 
@@ -48,7 +48,7 @@ class Comparison(NamedTuple):
     notes: tuple[str, ...]
 
 
-def compare_runs(paths: Sequence[Path]) -> Comparison:
+def compare_runs(paths: Sequence[Path]) -> RunComparison:
     """The first run with each of the others. Raises UsageError for fewer than two, what `read_whole_run` raises, and
     RunError, naming folder and remedy, for runs that are of different suites, or share no scenario."""
     if len(paths) < 2:
@@ -65,7 +65,7 @@ def compare_runs(paths: Sequence[Path]) -> Comparison:
     differences = pd.concat([differences_of(*pair, groups) for pair in pairs], ignore_index=True)
     flipped = pd.concat([flipped_between(*pair) for pair in pairs], ignore_index=True)
     notes = (*_notes(runs, [before, *others]), *_lonely(pairs))
-    return Comparison(runs[0].spec.suite, before, tuple(others), differences, flipped, notes)
+    return RunComparison(runs[0].spec.suite, before, tuple(others), differences, flipped, notes)
 
 
 def groups_of(suite: str, scenarios: Iterable[Scenario]) -> dict[tuple[str, str], frozenset[str]]:

@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
-from cosim.records.comparison import ComparedRun, Comparison
+from cosim.records.comparison import ComparedRun, RunComparison
 from cosim.records.paired import FEWEST_CHANGED
 from cosim.records.results import BOOTSTRAP
 
@@ -37,7 +37,7 @@ class WrittenTable(NamedTuple):
     names: int
 
 
-def tables_of_comparison(told: Comparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
+def tables_of_comparison(told: RunComparison, other: ComparedRun) -> tuple[WrittenTable, ...]:
     """Of the first run and one of the others: the whole suite by metric, and its groups by the most telling metrics.
     What no pair of episodes has is left out."""
     told_of = told.differences["after"] == other.label
@@ -67,7 +67,7 @@ def _signed(value: float) -> str:
     return f"{value + 0.0:+.{3 if abs(value) < 10.0 else 2 if abs(value) < 100.0 else 1}f}"
 
 
-def flips_in_words(told: Comparison, other: ComparedRun) -> tuple[str, ...]:
+def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
     """Which scenarios the other run won, and which it lost, by name."""
     flipped = told.flipped[told.flipped["after"] == other.label]
     lines = []
@@ -77,7 +77,7 @@ def flips_in_words(told: Comparison, other: ComparedRun) -> tuple[str, ...]:
     return tuple(lines)
 
 
-def how_to_read(told: Comparison) -> str:
+def how_to_read(told: RunComparison) -> str:
     """What the figures are, in words."""
     shown = int((told.differences["n"] > 0).sum())
     return (
@@ -89,7 +89,7 @@ def how_to_read(told: Comparison) -> str:
     )
 
 
-def as_markdown(told: Comparison) -> str:
+def as_markdown(told: RunComparison) -> str:
     """All of it for a page of Markdown."""
     blocks = []
     for other in told.others:
@@ -102,7 +102,7 @@ def as_markdown(told: Comparison) -> str:
     return "\n\n".join([*blocks, *map(_in_markdown, (*told.notes, how_to_read(told)))]) + "\n"
 
 
-def as_latex(told: Comparison) -> str:
+def as_latex(told: RunComparison) -> str:
     """All of it for a paper, to be taken in with \\input; it needs no package."""
     blocks = []
     for other in told.others:
@@ -132,5 +132,5 @@ def _one_line(text: str) -> str:
     return " ".join(text.split())
 
 
-FORMATS: Final[dict[str, Callable[[Comparison], str]]] = {".md": as_markdown, ".tex": as_latex}
+FORMATS: Final[dict[str, Callable[[RunComparison], str]]] = {".md": as_markdown, ".tex": as_latex}
 """By the end of a file's name."""

@@ -17,7 +17,14 @@ from rich.console import Console
 
 from cosim.cli.compare import print_comparison
 from cosim.judge.metrics import METRICS
-from cosim.records.comparison import ComparedRun, Comparison, compare_runs, differences_of, flipped_between, groups_of
+from cosim.records.comparison import (
+    ComparedRun,
+    RunComparison,
+    compare_runs,
+    differences_of,
+    flipped_between,
+    groups_of,
+)
 from cosim.records.run_folder import RunFolder, read_spec
 from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
 from cosim.spec.events import Event
@@ -55,7 +62,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def row(told: Comparison, metric: str, group: str = "s", after: str = "b") -> pd.Series[float]:
+def row(told: RunComparison, metric: str, group: str = "s", after: str = "b") -> pd.Series[float]:
     table = told.differences
     (one,) = table.index[(table["metric"] == metric) & (table["group"] == group) & (table["after"] == after)]
     found: pd.Series[float] = table.loc[one]
