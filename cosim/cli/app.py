@@ -25,6 +25,7 @@ from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, lis
 from cosim.cli.map import map_app
 from cosim.cli.output import told_streams
 from cosim.cli.progress import doing
+from cosim.cli.report import report
 from cosim.cli.scenario import scenario_app
 from cosim.cli.score import score
 from cosim.cli.suite import suite_app
@@ -331,6 +332,11 @@ app.command(
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(
     film
 )
+app.command(
+    rich_help_panel=LOOK,
+    epilog="Examples:  \n`cosim report runs/mine -o report.html`  \n"
+    "`cosim report runs/unit-mine runs/reactive-mine runs/reactive-theirs --failures 24`",
+)(report)
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")(export)
 app.command("counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Final
 
 import cv2
@@ -40,6 +40,7 @@ ROAD: Final[Rgb255] = (120, 120, 124)
 VERGE: Final[Rgb255] = (150, 200, 150)
 _WALK: Final[Rgb255] = (238, 236, 230)
 _CROSSING: Final[Rgb255] = (250, 250, 190)
+_GROUNDS: Final = {"road": ROAD, "verge": VERGE, "walk": _WALK, "crossing": _CROSSING}
 ROUTE: Final[Rgb255] = (60, 120, 220)
 TRACK: Final[Rgb255] = (20, 20, 20)
 BARRIER: Final[Rgb255] = (210, 30, 30)
@@ -159,17 +160,21 @@ def draw_ends_and_events(sheet: Sheet, scenario: Scenario) -> None:
 
 def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
     """Ground zones of a part of a map."""
+    for kind, shape in street_areas(street_map, area):
+        sheet.area(shape, _GROUNDS[kind])
+
+
+def street_areas(street_map: StreetMap, area: Polygon) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
+    """What lies in a part of a map, in the order in which it is drawn: road, verge, walk or crossing, and its shape."""
     lanes = [piece for piece in street_map.near("lane", area) if isinstance(piece, Lane)]
     for junction in street_map.near("junction", area):
-        sheet.area(junction.polygon, ROAD)
-    for kind, colour in (("road", ROAD), ("verge", VERGE)):
-        for lane in lanes:
-            if lane.kind == kind:
-                sheet.area(lane.polygon, colour)
+        yield "road", junction.polygon
+    for kind in ("road", "verge"):
+        yield from ((kind, lane.polygon) for lane in lanes if lane.kind == kind)
     for corner in street_map.near("corner", area):
-        sheet.area(corner.polygon, _WALK)
+        yield "walk", corner.polygon
     for strip in street_map.near("strip", area):
-        sheet.area(strip.polygon, _CROSSING if strip.id.startswith(":") else _WALK)
+        yield "crossing" if strip.id.startswith(":") else "walk", strip.polygon
 
 
 def draw_track(sheet: Sheet, log: Log) -> None:

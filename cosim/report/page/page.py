@@ -1,0 +1,252 @@
+"""The report as one HTML file: text, style, scripts, data and pictures in it; it asks nobody for anything."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from html import escape
+from importlib.resources import files
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from cosim.core.telling import duration
+from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
+from cosim.report.page.reasons import CAUSES
+from cosim.report.page.runs import ReportedRun
+from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
+
+_POLICY: Final = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+"""What the page may load: nothing from outside."""
+_MOST_TOLD: Final = 12
+"""Of crashed and invalid episodes of a run so many are told by name."""
+
+
+class Maps(msgspec.Struct, frozen=True):
+    """Where things went wrong. pictures: of some places; spots: of all, by place; episodes: of each place, all and
+    failed."""
+
+    pictures: list[PlacePicture]
+    spots: dict[str, list[Spot]]
+    episodes: dict[str, tuple[int, int]]
+
+
+def colours_of(runs: Sequence[ReportedRun]) -> dict[str, str]:
+    """A colour for each label, the same in all plots."""
+    labels = dict.fromkeys(run.label for run in runs)
+    return {label: RUN_COLOURS[k % len(RUN_COLOURS)] for k, label in enumerate(labels)}
+
+
+def page_of(
+    runs: Sequence[ReportedRun], plots: Sequence[Plot], entries: Sequence[Entry], maps: Maps, note: str
+) -> bytes:
+    """The file. note: what the gallery could not show, "" if nothing."""
+    from plotly.offline import get_plotlyjs
+
+    labels = list(dict.fromkeys(run.label for run in runs))
+    title = f"{' · '.join(labels)}: cosim report"
+    sections = {
+        "results": ("Results", f"{warnings_html(runs)}{summary_html(runs, colours_of(runs))}{tables_html(runs)}"),
+        "plots": ("Where it goes wrong", f'<div class="plots">{"".join(map(_plot, range(len(plots)), plots))}</div>'),
+        "failures": ("Failures", _gallery(entries, note)),
+        "places": ("Places", _places(maps)),
+        "runs": ("What was run", _what_was_run(runs)),
+    }
+    if not entries and not note:
+        del sections["failures"]
+    if not maps.spots:
+        del sections["places"]
+    nav = "".join(f'<a href="#{name}">{words}</a>' for name, (words, _) in sections.items())
+    body = "".join(
+        f'<section id="{name}"><h2>{words}</h2>{inner}</section>' for name, (words, inner) in sections.items()
+    )
+    data = {
+        "plots": [plot.figure for plot in plots],
+        "causes": CAUSE_COLOURS,
+        "maps": maps,
+    }
+    scenes = [_json(f"scene-{k}", entry.scene) for k, entry in enumerate(entries) if entry.scene is not None]
+    assets = files("cosim.report.page")
+    style, viewer, script = (
+        (assets / name).read_text(encoding="utf-8") for name in ("page.css", "viewer.html", "page.js")
+    )
+    text = (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1"><title>{escape(title)}</title>'
+        f"<style>{style}</style></head><body>"
+        f'<header><p class="mark">cosim report</p><h1>{_lede(runs)}</h1></header><nav aria-label="Parts">{nav}</nav>'
+        f"<main>{body}</main>{viewer}"
+        f"<script>{get_plotlyjs()}</script>{_json('data', data)}{''.join(scenes)}<script>{script}</script>"
+        "</body></html>\n"
+    )
+    return text.encode()
+
+
+def _json(name: str, value: object) -> str:
+    """Data in the page: nothing in it can end the element that it stands in."""
+    text = msgspec.json.encode(value, enc_hook=np.generic.item).decode()
+    safe = text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+    return f'<script type="application/json" id="{name}">{safe}</script>\n'
+
+
+def _lede(runs: Sequence[ReportedRun]) -> str:
+    labels = [escape(label) for label in dict.fromkeys(run.label for run in runs)]
+    suites = [escape(name) for name in dict.fromkeys(run.spec.suite for run in runs)]
+    episodes = sum(len(run.records) for run in runs)
+    return f"{_listed(labels)} on {_listed(suites)}: {episodes:,} episode{'s' * (episodes != 1)}"
+
+
+def _listed(words: Sequence[str]) -> str:
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
+
+
+def _plot(number: int, plot: Plot) -> str:
+    return (
+        f'<figure class="plot"><figcaption><h3>{escape(plot.title)}</h3><p>{escape(plot.note)}</p></figcaption>'
+        f'<div class="drawing" data-plot="{number}" style="min-height:{plot.figure["layout"]["height"]}px" '
+        f'role="img" aria-label="{escape(plot.title)}"></div></figure>'
+    )
+
+
+def _gallery(entries: Sequence[Entry], note: str) -> str:
+    fields = {"run": "label", "cause": "cause", "kind": "kind", "place": "place"}
+    choices = []
+    for name, field in fields.items():
+        counts = Counter(str(getattr(entry, field)) for entry in entries)
+        values = sorted(counts, key=lambda v: CAUSES.index(v) if v in CAUSES else -1) if field == "cause" else [*counts]
+        options = "".join(f'<option value="{escape(v)}">{escape(v)} ({counts[v]})</option>' for v in values)
+        choices.append(
+            f'<label>{name}<select data-field="{field}"><option value="">all</option>{options}</select></label>'
+        )
+    cards = "".join(_card(number, entry) for number, entry in enumerate(entries))
+    intro = (
+        f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, and every real place "
+        "that was driven. Open one to see its last seconds again: from above, by the robot's camera, from behind."
+    )
+    said = f'<p class="warn">{escape(note)}</p>' if note else ""
+    return (
+        f'<p class="intro">{intro}</p>{said}<div class="filters">{"".join(choices)}<output id="shown"></output></div>'
+        f'<ol class="cards">{cards}</ol>'
+    )
+
+
+def _card(number: int, entry: Entry) -> str:
+    facts = " · ".join(escape(part) for part in dict.fromkeys((entry.label, entry.event or entry.kind, entry.place)))
+    about = (
+        f'<span class="cause" style="--c:{CAUSE_COLOURS[entry.cause]}">{escape(entry.cause)}</span>'
+        f"<b>{escape(entry.reason[:1].upper() + entry.reason[1:])}.</b>"
+        f"<small>{facts}<br>{escape(entry.scenario)}, {entry.at_s:.1f} s</small>"
+    )
+    attributes = "".join(
+        f' data-{name}="{escape(str(getattr(entry, name)))}"' for name in ("label", "cause", "kind", "place")
+    )
+    if entry.scene is None:
+        return f'<li{attributes}><div class="card bare">{about}<small>{escape(entry.why)}</small></div></li>'
+    shot = entry.scene.pictures.follow[-1] if entry.scene.pictures.follow else ""
+    picture = f'<img src="{shot}" alt="" width="384" height="216" decoding="async">' if shot else ""
+    return f'<li{attributes}><button class="card" type="button" data-entry="{number}">{picture}{about}</button></li>'
+
+
+def _places(maps: Maps) -> str:
+    drawn = {picture.place for picture in maps.pictures}
+    options = "".join(
+        f'<option value="{k}">{escape(p.place)}: {len(maps.spots.get(p.place, ()))} failures</option>'
+        for k, p in enumerate(maps.pictures)
+    )
+    chooser = (
+        f'<div class="filters"><label>place<select id="place">{options}</select></label></div>'
+        '<figure class="plot"><div id="map" class="drawing" role="img" aria-label="Failures on the map"></div></figure>'
+        if options
+        else ""
+    )
+    rows = []
+    for place, (episodes, failed) in maps.episodes.items():
+        causes = Counter(spot.cause for spot in maps.spots.get(place, ()))
+        told = ", ".join(f"{cause} {causes[cause]}" for cause in CAUSES if causes[cause])
+        mark = "" if place in drawn else ' class="quiet"'
+        rows.append(
+            f'<tr{mark}><th scope="row">{escape(place)}</th><td>{episodes}</td><td>{failed}</td>'
+            f'<td class="word">{escape(told)}</td></tr>'
+        )
+    heads = '<th scope="col">place</th><th scope="col">episodes</th><th scope="col">failed</th>'
+    heads += '<th scope="col" class="word">what went wrong</th>'
+    listed = wide_html("All places", f"<tr>{heads}</tr>", rows)
+    return (
+        f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}'
+        f"<details><summary>All {len(maps.episodes)} places</summary>{listed}</details>"
+    )
+
+
+def _what_was_run(runs: Sequence[ReportedRun]) -> str:
+    """What each run was, so that somebody else can do it again: what they share once, the rest side by side."""
+    facts = [_facts(run) for run in runs]
+    shared = {name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)}
+    parts = [_listing(shared)] if shared else []
+    if differing := [name for name in facts[0] if name not in shared]:
+        heads = "".join(f'<th scope="col">{escape(run.label)}, {escape(run.spec.suite)}</th>' for run in runs)
+        rows = [
+            f'<tr><th scope="row">{name}</th>{"".join(f"<td>{escape(one[name])}</td>" for one in facts)}</tr>'
+            for name in differing
+        ]
+        parts.append(wide_html("What differs", f"<tr><td></td>{heads}</tr>", rows, "facts"))
+    return "".join([*parts, *(_lost(run) for run in runs)])
+
+
+def _listing(facts: Mapping[str, str]) -> str:
+    items = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts.items())
+    return f'<div class="run"><dl>{items}</dl></div>'
+
+
+def _facts(run: ReportedRun) -> dict[str, str]:
+    spec = run.spec
+    walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
+    wall = f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode" if walls else "not told"
+    return {
+        "policy": f"{spec.policy_name} {spec.policy_version} ({spec.policy})",
+        "its source": spec.policy_source or "not told",
+        "suite": f"{spec.suite} {spec.suite_version}, {spec.suite_hash}",
+        "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended",
+        "metric schema": str(run.table["metric_schema"].iloc[0]),
+        "camera": f"{run.table['camera'].iloc[0]}, at {spec.rate_hz:g} Hz",
+        "drawn by": spec.renderer,
+        "goal": spec.goal_protocol,
+        "odometry": spec.odometry,
+        "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
+        "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
+        "waypoints": spec.waypoints.in_words,
+        "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
+        "seed of the run": str(spec.seed),
+        "wall time": wall,
+        "folder": str(run.path),
+        "versions": ", ".join(f"{name} {number}" for name, number in sorted(spec.versions.items())),
+    }
+
+
+def _lost(run: ReportedRun) -> str:
+    """The episodes that crashed or are invalid, and why."""
+    bad = run.table[run.table["status"] != "done"]
+    told = [
+        f"{status} {name}: {why}" for status, name, why in bad[["status", "scenario", "reason"]].itertuples(index=False)
+    ]
+    if not told:
+        return ""
+    more = [f"and {len(told) - _MOST_TOLD} more"] if len(told) > _MOST_TOLD else []
+    lines = "".join(f"<li>{escape(line)}</li>" for line in [*told[:_MOST_TOLD], *more])
+    title = f"{escape(run.label)}, {escape(run.spec.suite)}: without a result"
+    return f'<div class="run"><h3>{title}</h3><ul>{lines}</ul></div>'
+
+
+def counts_of(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:
+    """Episodes and failed episodes of each place, the most failures first."""
+    total: Counter[str] = Counter()
+    failed: Counter[str] = Counter()
+    for run in runs:
+        for place, status, success in run.table[["place", "status", "success"]].itertuples(index=False):
+            total[place] += 1
+            failed[place] += status == "crashed" or (status == "done" and not success)
+    return {
+        place: (total[place], failed[place]) for place, _ in sorted(total.items(), key=lambda i: (-failed[i[0]], i[0]))
+    }

@@ -1,0 +1,266 @@
+"""The plots of a report, as figures of Plotly: plain values, drawn in the browser by the library in the page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.geometry import Floats
+from cosim.core.telling import Tell, untold
+from cosim.episode.log import Log
+from cosim.records.record import Record
+from cosim.records.results import interval_of
+from cosim.report.page.reasons import CAUSES, mishaps_of
+from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
+from cosim.report.page.three_tables import (
+    EVENT_COLUMNS,
+    UNIT_COLUMNS,
+    MeanOfEpisodes,
+    cell_of,
+    episodes_of,
+    kind_in_words,
+)
+
+RUN_COLOURS: Final = ("#1f5fa8", "#d9722b", "#3b8f5a", "#8a5aa8", "#b03a48", "#5b6770", "#b8912f", "#2a9d9d")
+CAUSE_COLOURS: Final = dict(
+    zip(
+        ("success", *CAUSES, "invalid"),
+        ("#a9cfae", "#c8452f", "#7b2d26", "#d99a3d", "#8a5aa8", "#4f86c6", "#8b97a3", "#c06aa0", "#333333", "#dddddd"),
+        strict=True,
+    )
+)
+NEAR_M: Final = 10.0
+_NEAR_EDGES: Final = (1.0, 3.0, 6.0, 10.0)
+_NEAR_WORDS: Final = ("nobody", "1 to 2", "3 to 5", "6 to 9", "10 or more")
+_SPEED_EDGES: Final = (0.25, 0.75, 1.25, 1.75)
+_SPEED_WORDS: Final = ("below 0.25", "0.25 to 0.75", "0.75 to 1.25", "1.25 to 1.75", "above 1.75")
+_LEAST_M: Final = 20.0
+"""Of fewer metres travelled no rate is shown."""
+_FAMILIES: Final[Mapping[PaperTable, str]] = {
+    "unit": "unit tests",
+    "reactive": "people in the way",
+    "long": "long ways",
+}
+
+
+class Plot(NamedTuple):
+    """One figure: what is said above it, data and layout as Plotly takes them."""
+
+    title: str
+    note: str
+    figure: dict[str, Any]
+
+
+class Exposure(NamedTuple):
+    """One episode, split by what was around at each moment: failures (B,), metres travelled (B,)."""
+
+    failures: Floats
+    metres: Floats
+
+
+def plots_of(runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell = untold) -> list[Plot]:
+    """Every plot that the runs have something for. colours: of the labels."""
+    rate = "Failures per 100 m"
+    found = [
+        _by(runs, colours, "unit", "kind", UNIT_COLUMNS, "success", "Success by structure"),
+        _by(runs, colours, "reactive", "kind", EVENT_COLUMNS, "success", "Success by event"),
+        _endings(runs),
+        _rates_by_cause(runs),
+        _by(runs, colours, "unit", "light", KINDS_OF_LIGHT, "success", "Success by light, unit tests"),
+        _by(runs, colours, "reactive", "light", KINDS_OF_LIGHT, "success", "Success by light, people in the way"),
+        _by(runs, colours, "long", "light", KINDS_OF_LIGHT, "failures_per_100m", f"{rate} by light, long ways"),
+    ]
+    near, fast = _exposures(runs, tell)
+    people = {label: parts for (label, family), parts in near.items() if family == "long"}
+    speed: dict[str, dict[str, list[Exposure]]] = {"long ways": {}, "short ways": {}}
+    for (label, family), parts in fast.items():
+        speed["long ways" if family == "long" else "short ways"].setdefault(label, []).extend(parts)
+    note = "Pooled: the failures that happened so, on the metres that were driven so; bars are 95 % intervals."
+    found.append(_exposed(people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note))
+    for words, of in speed.items():
+        found.append(_exposed(of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", note))
+    return [plot for plot in found if plot is not None]
+
+
+def near_of(log: Log) -> Floats:
+    """(T,) how many people were within NEAR_M of the robot, as recorded once a second."""
+    counts = np.zeros(len(log))
+    ticks = np.unique(log.people_tick)
+    if not len(ticks):
+        return counts
+    every = int(np.diff(ticks).min()) if len(ticks) > 1 else len(log)
+    away = log.people_xy - log.pose[np.minimum(log.people_tick, len(log) - 1), :2]
+    close = log.people_tick[np.hypot(away[:, 0], away[:, 1]) < NEAR_M]
+    by_tick = np.bincount(close, minlength=len(log))
+    return by_tick[np.arange(len(log)) // every * every].astype(float)
+
+
+def exposure_of(record: Record, log: Log, value: Floats, edges: Sequence[float], *, moving: bool) -> Exposure:
+    """Failures and metres of an episode by a value that it has at each tick, (T,). moving: freezings, which have no
+    metres, are left out."""
+    bins = np.digitize(value, edges)
+    ticks = [f.tick for f in record.failures if f.tick < len(log) and not (moving and f.kind == "freezing")]
+    count = len(edges) + 1
+    failures = np.bincount(bins[np.array(ticks, dtype=int)], minlength=count).astype(float)
+    return Exposure(failures, np.bincount(bins, weights=log.travelled_m, minlength=count).astype(float))
+
+
+_ByRun = dict[tuple[str, PaperTable], list[Exposure]]
+
+
+def _exposures(runs: Sequence[ReportedRun], tell: Tell) -> tuple[_ByRun, _ByRun]:
+    """Of every episode with a trajectory: by people near, by speed."""
+    near: _ByRun = {}
+    fast: _ByRun = {}
+    for number, run in enumerate(runs):
+        tell("reading trajectories", number / len(runs))
+        for record, log in run.logs():
+            key = run.label, table_of_paper(run.scenarios[record.scenario])
+            if key[1] == "long":
+                near.setdefault(key, []).append(exposure_of(record, log, near_of(log), _NEAR_EDGES, moving=False))
+            speed = np.abs(log.speed[:, 0])
+            began = np.concatenate([speed[:1], speed[:-1]])
+            fast.setdefault(key, []).append(exposure_of(record, log, began, _SPEED_EDGES, moving=True))
+    return near, fast
+
+
+def _exposed(
+    of: Mapping[str, list[Exposure]], colours: Mapping[str, str], words: Sequence[str], title: str, note: str
+) -> Plot | None:
+    cells: dict[str, list[MeanOfEpisodes]] = {}
+    for label, parts in of.items():
+        failures, metres = np.array([p.failures for p in parts]), np.array([p.metres for p in parts])
+        if not failures.any():
+            continue
+        cells[label] = [
+            MeanOfEpisodes(100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum()))
+            if m.sum() >= _LEAST_M
+            else MeanOfEpisodes(np.nan, np.nan, np.nan, 0)
+            for f, m in zip(failures.T, metres.T, strict=True)
+        ]
+    present = [k for k in range(len(words)) if any(row[k].n for row in cells.values())]
+    if len(present) < 2:
+        return None
+    cells = {label: [row[k] for k in present] for label, row in cells.items()}
+    return Plot(title, note, _points(cells, colours, [words[k] for k in present], "per 100 m", share=False))
+
+
+def _by(
+    runs: Sequence[ReportedRun], colours: Mapping[str, str], family: PaperTable, column: str, order: Sequence[str],
+    metric: str, title: str,
+) -> Plot | None:  # fmt: skip
+    """A metric of a family by the values of a column; nothing where there is but one value."""
+    tables = episodes_of(runs, family)
+    present = [value for value in order if any((table[column] == value).any() for table in tables.values())]
+    if len(present) < 2:
+        return None
+    cells = {
+        label: [cell_of(table[table[column] == value], metric) for value in present] for label, table in tables.items()
+    }
+    share = metric == "success"
+    note = "Points are means, bars 95 % intervals; hover for figures." if share else "Pooled; bars are 95 % intervals."
+    words = [escape(kind_in_words(value)) for value in present]
+    return Plot(title, note, _points(cells, colours, words, "success" if share else "per 100 m", share=share))
+
+
+def _points(
+    cells: Mapping[str, Sequence[MeanOfEpisodes]],
+    colours: Mapping[str, str],
+    words: Sequence[str],
+    axis: str,
+    *,
+    share: bool,
+) -> dict[str, Any]:
+    """A row for each word, in it a point with its interval for each label."""
+    data = []
+    for label, row in cells.items():
+        shown = [(word, cell) for word, cell in zip(words, row, strict=True) if cell.n and not np.isnan(cell.mean)]
+        data.append(
+            {
+                "type": "scatter", "mode": "markers", "orientation": "h", "name": escape(label), "offsetgroup": label,
+                "x": [round(cell.mean, 4) for _, cell in shown], "y": [word for word, _ in shown],
+                "error_x": {
+                    "type": "data", "symmetric": False, "thickness": 1.6, "width": 0,
+                    "array": [round(cell.high - cell.mean, 4) for _, cell in shown],
+                    "arrayminus": [round(cell.mean - cell.low, 4) for _, cell in shown],
+                },
+                "marker": {"size": 9, "color": colours[label]},
+                "customdata": [[round(cell.low, 3), round(cell.high, 3), cell.n] for _, cell in shown],
+                "hovertemplate": "%{y}: %{x:.2f} (%{customdata[0]:.2f} to %{customdata[1]:.2f}), n = %{customdata[2]}",
+            }
+        )  # fmt: skip
+    scale = {"range": [-0.02, 1.02], "tickformat": ".1f"} if share else {"rangemode": "tozero"}
+    return {
+        "data": data,
+        "layout": {
+            "height": 96 + len(words) * (16 + 15 * len(cells)),
+            "scattermode": "group",
+            "showlegend": len(cells) > 1,
+            "xaxis": {"title": {"text": axis}, "zeroline": False, **scale},
+            "yaxis": {"autorange": "reversed", "categoryorder": "array", "categoryarray": list(words)},
+        },
+    }
+
+
+def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> dict[str, Any]:
+    """A bar for each row, made of causes."""
+    causes = [cause for cause in CAUSE_COLOURS if any(row.get(cause) for row in rows.values())]
+    data = [
+        {
+            "type": "bar", "orientation": "h", "name": cause, "marker": {"color": CAUSE_COLOURS[cause]},
+            "y": [escape(row) for row in rows],
+            "x": [round(row.get(cause, 0.0), 4) for row in rows.values()],
+            "hovertemplate": f"{cause}: %{{x:{form}}}",
+        }
+        for cause in causes
+    ]  # fmt: skip
+    yaxis = {"autorange": "reversed", "type": "category"}
+    layout = {"barmode": "stack", "height": 140 + 34 * len(rows), "bargap": 0.35, "showlegend": True, "yaxis": yaxis}
+    return {
+        "data": data,
+        "layout": layout | {"xaxis": {"title": {"text": axis}, "tickformat": form, "zeroline": False}},
+    }
+
+
+def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
+    """How short episodes ended, as shares."""
+    rows: dict[str, dict[str, float]] = {}
+    for run in runs:
+        for record in run.records:
+            family = table_of_paper(run.scenarios[record.scenario])
+            if family != "long":
+                row = rows.setdefault(f"{run.label}, {_FAMILIES[family]}", {})
+                went = mishaps_of(record)
+                what = "invalid" if record.status == "invalid" else went[0].cause if went else "success"
+                row[what] = row.get(what, 0.0) + 1.0
+    if not rows:
+        return None
+    shares = {name: {cause: n / sum(row.values()) for cause, n in row.items()} for name, row in rows.items()}
+    note = "Share of episodes by how they ended; at the first failure they are over."
+    return Plot("How short episodes end", note, _stacked(shares, "share of episodes", ".0%"))
+
+
+def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
+    """What goes wrong on long ways."""
+    counts: dict[str, dict[str, float]] = {}
+    metres: dict[str, float] = {}
+    for run in runs:
+        for record in run.records:
+            if table_of_paper(run.scenarios[record.scenario]) == "long" and record.status == "done":
+                metres[run.label] = metres.get(run.label, 0.0) + (record.measures.get("path_length_m") or 0.0)
+                row = counts.setdefault(run.label, {})
+                for mishap in mishaps_of(record):
+                    if mishap.failure is not None:
+                        row[mishap.cause] = row.get(mishap.cause, 0.0) + 1.0
+    rows = {
+        label: {cause: 100.0 * n / metres[label] for cause, n in row.items()}
+        for label, row in counts.items()
+        if metres[label] >= _LEAST_M
+    }
+    if not any(rows.values()):
+        return None
+    note = "Failures per 100 m travelled, all metres together. After a failure the robot is put back and goes on."
+    return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

@@ -1,0 +1,198 @@
+"""Why an episode failed, in words: from its record, its log, and who the other was."""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.episode.log import Log
+from cosim.judge.referee import FREEZE_MOVE_M, FREEZE_WINDOW_S, Failure
+from cosim.records.record import Record, TriggeredEvent
+from cosim.spec.events import Event
+from cosim.spec.scenario import Scenario
+
+_STANDS_MPS: Final = 0.2
+"""Slower than this somebody is said to have stood."""
+_ASTRAY_M: Final = 5.0
+"""Farther from the route there is no telling on which side of it the way was left."""
+_OVER_S: Final = 0.4
+"""Over so long a time a speed is taken from recorded places."""
+CAUSES: Final = (
+    "person", "vehicle", "obstacle", "off the sidewalk", "froze", "out of time", "broke the rule", "policy crashed",
+)  # fmt: skip
+"""Kinds of reasons, in the order in which they are shown."""
+_FURNITURE: Final = {
+    "sign": "sandwich board", "cafe": "cafe table", "bike": "parked bike", "box": "pile of parcels",
+    "fence": "construction fence", "scooter": "parked scooter",
+}  # fmt: skip
+
+
+class Other(NamedTuple):
+    """Whom or what the robot met: place and velocity in the robot's frame, x ahead and y left, metres and m/s."""
+
+    x_m: float
+    y_m: float
+    vx_mps: float
+    vy_mps: float
+
+    @classmethod
+    def seen_from(cls, robot: Floats, at: Floats, velocity: Floats) -> Other:
+        """From the world's frame. robot: (3,) x, y, heading; at, velocity: (2,)."""
+        cos, sin = math.cos(robot[2]), math.sin(robot[2])
+        turn = np.array([[cos, sin], [-sin, cos]])
+        return cls(*(turn @ (at - robot[:2])).tolist(), *(turn @ velocity).tolist())
+
+
+class Mishap(NamedTuple):
+    """What went wrong in an episode, and when. tick: of the log; failure: None where the referee counted none, as when
+    time ran out. cause: one of CAUSES."""
+
+    tick: int
+    cause: str
+    failure: Failure | None = None
+
+
+def mishaps_of(record: Record) -> list[Mishap]:
+    """Everything that went wrong in an episode, in order; nothing where it succeeded or is invalid."""
+    if record.status == "crashed":
+        return [Mishap(record.ticks, "policy crashed")]
+    if record.status == "invalid":
+        return []
+    found = [Mishap(failure.tick, cause_of(failure), failure) for failure in record.failures]
+    if not found and not record.measures.get("success"):
+        broke = record.ended in ("goal", "failure", "stop")
+        found.append(Mishap(max(record.ticks - 1, 0), "broke the rule" if broke else "out of time"))
+    return found
+
+
+def cause_of(failure: Failure) -> str:
+    """Which of CAUSES a failure is."""
+    if failure.kind == "out_of_lane":
+        return "off the sidewalk"
+    if failure.kind == "freezing":
+        return "froze"
+    return {"pedestrian": "person", "vehicle": "vehicle"}.get(failure.other_kind, "obstacle")
+
+
+def reason_of(scenario: Scenario, record: Record, mishap: Mishap, log: Log | None, other: Other | None = None) -> str:
+    """One sentence without its full stop. other: whom the robot met, where that is known better than from the log."""
+    if mishap.cause == "policy crashed":
+        return f"the policy crashed: {record.reason}"
+    failure = mishap.failure
+    if failure is None:
+        return _ended(scenario, record)
+    if failure.kind == "freezing":
+        near = _nearest(log, failure.tick)
+        return f"stayed within {FREEZE_MOVE_M:g} m for {FREEZE_WINDOW_S:g} s{near}"
+    if failure.kind == "out_of_lane":
+        return _left(scenario, failure)
+    if failure.other_kind == "pedestrian":
+        other = other or _in_tracks(scenario, failure, log)
+        return f"{_met(failure, other, 'a person')}{_after_trigger(scenario, record, failure)}"
+    if failure.other_kind == "vehicle":
+        return _met(failure, other, "a vehicle")
+    return f"drove into {thing_in_words(failure)} at {failure.robot_speed_mps:.1f} m/s"
+
+
+def thing_in_words(failure: Failure) -> str:
+    """What was touched that is neither person nor vehicle: "a parked bike"."""
+    kind = failure.other.rsplit(":", 1)[-1] if ":" in failure.other else failure.other_kind
+    words = _FURNITURE.get(kind, kind.replace("_", " ") or "something")
+    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+
+
+def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
+    """The event that a mishap belongs to: that of the person who was met, or the scenario's only one."""
+    who = mishap.failure.other if mishap.failure else ""
+    theirs = [event for event in scenario.events if who in event.names]
+    if not theirs and scenario.ends_on_failure and len(scenario.events) == 1:
+        return scenario.events[0]
+    return theirs[0] if theirs else None
+
+
+def _met(failure: Failure, other: Other | None, whom: str) -> str:
+    """A collision with somebody who moves, or who stood."""
+    stood = failure.robot_speed_mps < _STANDS_MPS
+    verb = "was hit by" if stood else "drove into" if failure.fault != "shared" else "ran into"
+    if other is None:
+        return f"{verb} {whom} at {failure.robot_speed_mps:.1f} m/s"
+    speed_mps = math.hypot(other.vx_mps, other.vy_mps)
+    thing = "who" if whom == "a person" else "that"
+    if speed_mps < _STANDS_MPS:
+        return (
+            f"{verb} {whom} {thing} stood {_side(other.x_m, other.y_m, 'ahead')}, at {failure.robot_speed_mps:.1f} m/s"
+        )
+    side = _side(-other.vx_mps, -other.vy_mps, "from the front", "from the ", "from behind")
+    if side == "from behind" and other.x_m > 0.0:
+        return f"{verb} {whom} {thing} went ahead of it at {speed_mps:.1f} m/s"
+    return f"{verb} {whom} {thing} came {side} at {speed_mps:.1f} m/s"
+
+
+def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = "behind") -> str:
+    """Which side of the robot a direction in its frame is."""
+    angle = abs(math.degrees(math.atan2(y, x)))
+    if angle <= 45.0:
+        return front
+    return behind if angle >= 135.0 else aside + ("left" if y > 0.0 else "right")
+
+
+def _in_tracks(scenario: Scenario, failure: Failure, log: Log | None) -> Other | None:
+    """Who of an event was met, from the tracks of its people; None for anybody else."""
+    if log is None:
+        return None
+    for number, event in enumerate(scenario.events):
+        if failure.other in event.names:
+            of_it = (log.event_tracks[:, 1] == number) & (log.event_tracks[:, 2] == event.names.index(failure.other))
+            track = log.event_tracks[of_it & (log.event_tracks[:, 0] <= failure.tick)]
+            if len(track):
+                since = track[track[:, 0] >= track[-1, 0] - round(_OVER_S / log.tick_s)]
+                ticks = max(since[-1, 0] - since[0, 0], 1.0)
+                velocity = (since[-1, 3:5] - since[0, 3:5]) / (ticks * log.tick_s)
+                return Other.seen_from(log.pose[failure.tick], track[-1, 3:5], velocity)
+    return None
+
+
+def _after_trigger(scenario: Scenario, record: Record, failure: Failure) -> str:
+    event = event_of(scenario, Mishap(failure.tick, "person", failure))
+    told: TriggeredEvent | None = next((e for e in record.events if event is not None and e.id == event.id), None)
+    if told is None:
+        return ""
+    if told.triggered_at_s is None:
+        return ", before its event began"
+    after_s = Clock().time_s(failure.tick + 1) - told.triggered_at_s
+    return f", {after_s:.1f} s after the trigger" if after_s >= 0.0 else ", before its event began"
+
+
+def _left(scenario: Scenario, failure: Failure) -> str:
+    near = (failure.route_s_m - 5.0, failure.route_s_m + 5.0)
+    _, left_m = scenario.route_line.project(failure.x_m, failure.y_m, near)
+    if abs(left_m) > _ASTRAY_M:
+        return f"left the walkable ground at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.0f} m off the route"
+    crossing = any(c.enter_s_m <= failure.route_s_m <= c.leave_s_m for c in scenario.crossings)
+    where = "crosswalk" if crossing else "sidewalk"
+    side = "left" if left_m > 0.0 else "right"
+    return (
+        f"left the {where} on its {side} side at {failure.robot_speed_mps:.1f} m/s, {abs(left_m):.1f} m off the route"
+    )
+
+
+def _nearest(log: Log | None, tick: int) -> str:
+    if log is None or not tick < len(log) or not log.person_m[tick] < 3.0:
+        return ""
+    return f", the nearest person {log.person_m[tick]:.1f} m away"
+
+
+def _ended(scenario: Scenario, record: Record) -> str:
+    """An episode that failed without a failure of the referee's."""
+    done = 100.0 * (record.measures.get("route_completion") or 0.0)
+    if record.ended == "goal":
+        return "came to the goal, but went between people of a group it should have passed round"
+    if record.ended == "failure":
+        return "passed the person who held out a stopping hand"
+    if scenario.ends_at == "stop":
+        return f"did not stop for the stopping hand within {scenario.time_limit_s:.0f} s"
+    return f"ran out of time after {scenario.time_limit_s:.0f} s, with {done:.0f} % of the route done"

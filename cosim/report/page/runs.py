@@ -1,0 +1,156 @@
+"""The runs that a report is about, read whole, and refused in one line where a table of them would mislead."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Final, Literal
+
+import pandas as pd
+
+from cosim.core.errors import RunError, UsageError
+from cosim.core.telling import Tell, untold
+from cosim.episode.log import Log
+from cosim.records.record import Record
+from cosim.records.results import table_of
+from cosim.records.run_folder import RunSpec
+from cosim.records.whole_run import WholeRun, anew, read_whole_run, record_file
+from cosim.spec.scenario import CityMap, Light, Scenario
+
+PaperTable = Literal["unit", "reactive", "long"]
+"""Short ways past things; short ways with one event, or the same without; long ways, which go on after a failure."""
+KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
+_OVERCAST: Final = 0.8
+_LOW_SUN_DEG: Final = 20.0
+
+
+@dataclass(frozen=True)
+class ReportedRun:
+    """One run. label: what it is called on the page: its policy, or its folder where two runs of a suite have the same
+    policy. table: a row per episode with the columns of `table_of` and kind, family, place, real, light."""
+
+    label: str
+    whole: WholeRun
+
+    @property
+    def path(self) -> Path:
+        return self.whole.path
+
+    @property
+    def spec(self) -> RunSpec:
+        return self.whole.spec
+
+    @property
+    def scenarios(self) -> Mapping[str, Scenario]:
+        return self.whole.scenarios
+
+    @property
+    def records(self) -> tuple[Record, ...]:
+        """Sorted by scenario."""
+        return tuple(self.whole.records.values())
+
+    @cached_property
+    def table(self) -> pd.DataFrame:
+        table = table_of(self.records)
+        of = [self.scenarios[name] for name in table["scenario"]]
+        return table.assign(
+            label=self.label,
+            kind=[example_of(one) for one in of],
+            family=[table_of_paper(one) for one in of],
+            place=[place_in_words(one) for one in of],
+            real=[isinstance(one.place, CityMap) for one in of],
+            light=[light_in_words(one.light) for one in of],
+        )
+
+    def log(self, scenario: str) -> Log | None:
+        """The trajectory of an episode; None where the folder has none. Raises RunError for a damaged one."""
+        file = record_file(self.path, scenario)
+        path = file.with_name("trajectory.npz")
+        if not path.exists():
+            return None
+        try:
+            return Log.load(path)
+        except RunError as error:
+            raise RunError(f"{error}: {anew(file)}") from error
+
+    def logs(self) -> Iterator[tuple[Record, Log]]:
+        """The episodes that have a trajectory."""
+        for record in self.records:
+            if record.ended is not None and (log := self.log(record.scenario)) is not None:
+                yield record, log
+
+
+def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
+    """Raises UsageError where a run is given twice, RunError for runs whose figures cannot stand in one table, and what
+    `read_whole_run` raises."""
+    resolved = [path.resolve() for path in paths]
+    for path, real in zip(paths, resolved, strict=True):
+        if resolved.count(real) > 1:
+            raise UsageError(f"{path} is given twice: name each run once")
+    found = []
+    for path in paths:
+        tell(f"reading {path}")
+        found.append(read_whole_run(path))
+    _refuse_other_suites(found)
+    policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]
+    folders = [whole.path.name for whole in found]
+    alike = {policy for suite, policy in policies if policies.count((suite, policy)) > 1}
+    names = [path.name if folders.count(path.name) == 1 else str(path) for path in paths]
+    return [
+        ReportedRun(name if whole.spec.policy_name in alike else whole.spec.policy_name, whole)
+        for whole, name in zip(found, names, strict=True)
+    ]
+
+
+def table_of_paper(scenario: Scenario) -> PaperTable:
+    """Which of the paper's three tables a scenario belongs to."""
+    if not scenario.ends_on_failure:
+        return "long"
+    return "reactive" if scenario.events or scenario.structure == "static" else "unit"
+
+
+def example_of(scenario: Scenario) -> str:
+    """What it is an example of: its structure, or the kind of its one event."""
+    if not scenario.structure and scenario.ends_on_failure and len(scenario.events) == 1:
+        return scenario.events[0].kind
+    return scenario.structure or ("route" if not scenario.ends_on_failure else "other")
+
+
+def place_in_words(scenario: Scenario) -> str:
+    """ "berlin-3", or "city 17"."""
+    where = scenario.place
+    if isinstance(where, CityMap):
+        return where.map
+    return f"city {where.seed}" + (f" ({where.size_m:g} m)" if where.size_m != 2000.0 else "")
+
+
+def light_in_words(light: Light) -> str:
+    """One of KINDS_OF_LIGHT: fog before clouds before the height of the sun."""
+    if light.fog_m is not None:
+        return "fog"
+    if light.cloud_cover >= _OVERCAST:
+        return "overcast"
+    return "low sun" if sun_deg(light) < _LOW_SUN_DEG else "high sun"
+
+
+def sun_deg(light: Light) -> float:
+    """The sun's height over the horizon, by the usual formula of hour, day and latitude."""
+    declination = math.radians(-23.44) * math.cos(2.0 * math.pi * (light.day_of_year + 10) / 365.25)
+    latitude, hour = math.radians(light.latitude_deg), math.radians(15.0 * (light.hour - 12.0))
+    up = math.sin(latitude) * math.sin(declination) + math.cos(latitude) * math.cos(declination) * math.cos(hour)
+    return math.degrees(math.asin(max(-1.0, min(1.0, up))))
+
+
+def _refuse_other_suites(runs: Sequence[WholeRun]) -> None:
+    """Raises RunError for two runs of one suite's name and not of one suite: their rows would be read as alike."""
+    first: dict[str, WholeRun] = {}
+    for run in runs:
+        other = first.setdefault(run.spec.suite, run)
+        if other.spec.suite_hash != run.spec.suite_hash:
+            raise RunError(
+                f"{run.path} and {other.path} are of different suites '{run.spec.suite}' ({run.spec.suite_hash}, "
+                f"{other.spec.suite_hash}): their rows cannot stand in one table. Report them apart, or run one again"
+            )

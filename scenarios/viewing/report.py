@@ -1,0 +1,216 @@
+"""The report of runs: reads them, shows failures again in processes of their own, and writes one HTML file."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
+import shapely
+
+from cosim.core.clock import Clock
+from cosim.core.errors import CosimError, unwritable
+from cosim.core.telling import Tell, untold
+from cosim.core.whole_file import write_whole
+from cosim.report.above import ROUTE, Sheet, draw_streets
+from cosim.report.page.choice import MOST_FAILURES, Shown, most_telling, shown_of
+from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.plots import plots_of
+from cosim.report.page.reasons import mishaps_of, reason_of
+from cosim.report.page.runs import ReportedRun, example_of, light_in_words, place_in_words, read_runs
+from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.spec.options import CameraChoice
+from cosim.spec.scenario import CityMap, Place, Scenario
+from scenarios.execution.places import place
+from scenarios.execution.shepherd import end_with
+from scenarios.viewing.scenes import ShownAgain, image_url, show_again
+
+_MOST_BYTES: Final = 29_000_000
+"""Of the file; failures beyond it are left out of the gallery, the least telling first."""
+_MOST_MAPS: Final = 24
+_MAP_PX: Final = 1000
+_MAP_QUALITY: Final = 70
+_MARGIN_M: Final = 25.0
+_MOST_SPOTS: Final = 300
+"""Of a place."""
+_T = TypeVar("_T")
+_Bounds = tuple[float, float, float, float]
+
+
+class ReportFacts(NamedTuple):
+    """What came out: the file's size, and how many failures its gallery shows of how many."""
+
+    size_bytes: int
+    shown: int
+    failures: int
+
+
+def make_report(
+    folders: Sequence[Path], output: Path, *, camera: CameraChoice = "auto", jobs: int = 2, most: int = MOST_FAILURES,
+    tell: Tell = untold,
+) -> ReportFacts:  # fmt: skip
+    """Write the report of these run folders. most: failures in its gallery.
+
+    Raises what `read_runs` raises, and MachineError when it cannot be written; then nothing is.
+    """
+    runs = read_runs(folders, tell)
+    plots = plots_of(runs, colours_of(runs), tell)
+    candidates = shown_of(runs)
+    picks = most_telling(candidates, most)
+    tell("starting the engines")
+    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=end_with, initargs=(os.getpid(),)) as pool:
+        try:
+            showings = _showings(pool, runs, picks, camera, tell)
+            pictures = _pictures(pool, runs, tell)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+    entries = [_entry(runs[pick.run], pick, showings[k]) for k, pick in enumerate(picks)]
+    tell("writing the page")
+
+    def made(count: int) -> bytes:
+        maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
+        return page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
+
+    count, data = len(entries), made(len(entries))
+    while len(data) > _MOST_BYTES and count:
+        count -= max(1, round(count * (1.0 - _MOST_BYTES / len(data))))
+        data = made(count)
+    try:
+        write_whole(output, data)
+    except OSError as error:
+        output.with_name(output.name + ".part").unlink(missing_ok=True)
+        raise unwritable(output, error) from error
+    return ReportFacts(len(data), count, len(candidates))
+
+
+def _showings(
+    pool: ProcessPoolExecutor, runs: Sequence[ReportedRun], picks: Sequence[Shown], camera: CameraChoice, tell: Tell
+) -> list[ShownAgain | str]:
+    """Every pick shown again, or why it could not be. The longest replays begin first."""
+    episodes: dict[tuple[int, str], list[int]] = {}
+    for k, pick in enumerate(picks):
+        episodes.setdefault((pick.run, pick.scenario), []).append(k)
+    found: list[ShownAgain | str] = [""] * len(picks)
+    asked: list[tuple[list[int], Future[list[ShownAgain]]]] = []
+    for (run, scenario), numbers in sorted(
+        episodes.items(), key=lambda item: -max(picks[k].mishap.tick for k in item[1])
+    ):
+        if runs[run].log(scenario) is None:
+            for k in numbers:
+                found[k] = "its trajectory is no longer in the run folder"
+            continue
+        mishaps = [picks[k].mishap for k in numbers]
+        asked.append((numbers, pool.submit(show_again, runs[run].path, scenario, mishaps, camera)))
+    for done, (numbers, future) in enumerate(asked):
+        tell("showing failures again", done / len(asked))
+        came = _outcome(future)
+        for place_of, k in enumerate(numbers):
+            found[k] = came if isinstance(came, str) else came[place_of]
+    return found
+
+
+def _outcome(future: Future[_T]) -> _T | str:
+    """What a process made, or in words why it did not."""
+    try:
+        return future.result()
+    except CosimError as error:
+        return str(error)
+    except BrokenProcessPool:
+        return "the process that ran it again died"
+
+
+def _entry(run: ReportedRun, pick: Shown, showing: ShownAgain | str) -> Entry:
+    scenario = run.scenarios[pick.scenario]
+    record = run.whole.records[pick.scenario]
+    other = None if isinstance(showing, str) else showing.other
+    return Entry(
+        label=run.label,
+        suite=run.spec.suite,
+        scenario=pick.scenario,
+        kind=example_of(scenario),
+        event=pick.event,
+        place=pick.place,
+        light=light_in_words(scenario.light),
+        cause=pick.mishap.cause,
+        reason=reason_of(scenario, record, pick.mishap, run.log(pick.scenario), other),
+        at_s=Clock().time_s(pick.mishap.tick + 1),
+        scene=None if isinstance(showing, str) else showing.scene,
+        why=showing if isinstance(showing, str) else "",
+    )
+
+
+def _note(entries: Sequence[Entry]) -> str:
+    """How many failures could not be shown again, and why the first of them could not."""
+    lost = [entry for entry in entries if entry.scene is None]
+    if not lost:
+        return ""
+    return f"{len(lost)} of {len(entries)} failures could not be shown again. {lost[0].scenario}: {lost[0].why}"
+
+
+def _pictures(pool: ProcessPoolExecutor, runs: Sequence[ReportedRun], tell: Tell) -> list[PlacePicture]:
+    """From above: every real place with failures, then those with the most."""
+    there: dict[str, list[Scenario]] = {}
+    for run in runs:
+        for record in run.records:
+            scenario = run.scenarios[record.scenario]
+            there.setdefault(place_in_words(scenario), []).append(scenario)
+    failed = [name for name, (_, bad) in counts_of(runs).items() if bad]
+    failed.sort(key=lambda name: not isinstance(there[name][0].place, CityMap))
+    asked = [
+        pool.submit(_place_picture, name, there[name][0].place, _bounds(there[name]), [s.route for s in there[name]])
+        for name in failed[:_MOST_MAPS]
+    ]
+    found = []
+    for done, future in enumerate(asked):
+        tell("drawing maps", done / len(asked))
+        came = _outcome(future)
+        if not isinstance(came, str):
+            found.append(came)
+    return found
+
+
+def _bounds(scenarios: Sequence[Scenario]) -> _Bounds:
+    """Around their routes, in metres, no flatter than 2 to 5 either way."""
+    route = np.concatenate([np.array(scenario.route) for scenario in scenarios])
+    low, high = route.min(axis=0) - _MARGIN_M, route.max(axis=0) + _MARGIN_M
+    room = np.maximum(0.4 * (high - low).max() - (high - low), 0.0) / 2.0
+    (x0, y0), (x1, y1) = (low - room).tolist(), (high + room).tolist()
+    return x0, y0, x1, y1
+
+
+def _place_picture(
+    name: str, where: Place, bounds: _Bounds, routes: Sequence[tuple[tuple[float, float], ...]]
+) -> PlacePicture:
+    """In a process of its own."""
+    _, street_map = place(where)
+    x0, y0, x1, y1 = bounds
+    sheet = Sheet(bounds, _MAP_PX / max(x1 - x0, y1 - y0))
+    draw_streets(sheet, street_map, shapely.box(*bounds))
+    for route in dict.fromkeys(routes):
+        sheet.line(np.array(route), ROUTE, max(0.4, 2.0 / sheet.px_per_m))
+    return PlacePicture(place=name, image=image_url(sheet.image, _MAP_QUALITY), bounds=bounds)
+
+
+def _spots(runs: Sequence[ReportedRun], picks: Sequence[Shown]) -> dict[str, list[Spot]]:
+    """Where everything went wrong, by place."""
+    numbers = {(pick.run, pick.scenario, pick.mishap): k for k, pick in enumerate(picks)}
+    spots: dict[str, list[Spot]] = {}
+    for number, run in enumerate(runs):
+        for record in run.records:
+            scenario = run.scenarios[record.scenario]
+            for mishap in mishaps_of(record):
+                x_m, y_m = (mishap.failure.x_m, mishap.failure.y_m) if mishap.failure else scenario.start[:2]
+                if mishap.failure is None and (log := run.log(record.scenario)) is not None and len(log):
+                    x_m, y_m = log.pose[-1, :2].tolist()
+                reason = reason_of(scenario, record, mishap, None)
+                words = f"{record.scenario} ({run.label}), {Clock().time_s(mishap.tick + 1):.1f} s: {reason}"
+                entry = numbers.get((number, record.scenario, mishap), -1)
+                spot = Spot(x_m=round(x_m, 2), y_m=round(y_m, 2), cause=mishap.cause, words=words, entry=entry)
+                spots.setdefault(place_in_words(scenario), []).append(spot)
+    return {name: sorted(there, key=lambda spot: spot.entry < 0)[:_MOST_SPOTS] for name, there in spots.items()}

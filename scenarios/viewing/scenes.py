@@ -1,0 +1,245 @@
+"""The last seconds before a failure, from the recorded episode run again: who was where, and what could be seen."""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import cv2
+import numpy as np
+import shapely
+
+from cosim.core.clock import Clock
+from cosim.core.geometry import Floats
+from cosim.core.state import PersonKind, RobotState, Street
+from cosim.episode.ports import CameraSpec, Eyes
+from cosim.episode.step import Step
+from cosim.judge.referee import Verdict
+from cosim.place.street_map import StreetMap
+from cosim.report.above import street_areas
+from cosim.report.legend import Image
+from cosim.report.page.reasons import Mishap, Other
+from cosim.report.page.scene import CrossingLight, Outline, Pictures, Scene, Track
+from cosim.spec.obstacle import footprint
+from cosim.spec.options import CameraChoice
+from cosim.spec.scenario import Scenario
+from scenarios.execution.places import place
+from scenarios.execution.replay import Alike, recorded, replaying
+from scenarios.viewing.look import eye_behind
+
+SHOWN_S: Final = 10.0
+"""From above, before the failure."""
+PICTURED_S: Final = 5.0
+_STEP_TICKS: Final = 2
+"""Between samples."""
+_PICTURE_TICKS: Final = 5
+_PEOPLE_M: Final = 25.0
+_VEHICLES_M: Final = 40.0
+_GROUND_M: Final = 22.0
+"""Beyond the robot's way."""
+FOLLOW_PX: Final = (384, 216)
+_WIDEST_PX: Final = 320
+_TALLEST_PX: Final = 240
+"""Of the robot's own camera, drawn larger or smaller than the policy saw it."""
+_QUALITY: Final = 58
+_OVER_SAMPLES: Final = 4
+"""Over so many samples the velocity of who was met is taken."""
+
+
+class ShownAgain(NamedTuple):
+    """A failure shown again, and whom the robot met."""
+
+    scene: Scene
+    other: Other | None
+
+
+def show_again(folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera: CameraChoice) -> list[ShownAgain]:
+    """Run a recorded episode again up to the last of these failures. Raises RunError when it comes out otherwise."""
+    told = recorded(folder, scenario_id)
+    _, street_map = place(told.scenario.place)
+    reels = [_Reel(told.scenario, mishap) for mishap in mishaps]
+    last = max(mishap.tick for mishap in mishaps) + 1
+    with ExitStack() as stack:
+        episode, policy = replaying(told, camera)
+        stack.enter_context(episode)
+        eyes = stack.enter_context(episode.eyes(robots_camera(told.record.camera)))
+        episode.watch(Alike(folder, told).watch)
+
+        def watch(step: Step, _: Verdict) -> None:
+            for reel in reels:
+                reel.take(step, eyes)
+
+        episode.watch(watch)
+        observation = episode.reset()
+        while not episode.over and episode.moment.tick < last:
+            observation = episode.advance(policy.act(observation))
+        return [reel.showing(street_map, episode.footprint_m) for reel in reels]
+
+
+def robots_camera(spec: CameraSpec | None) -> CameraSpec:
+    """The policy's own camera, in a size for a page; the standard one, 4:3, for a policy that has none."""
+    if spec is None:
+        return CameraSpec(_WIDEST_PX, _TALLEST_PX)
+    zoom = min(_WIDEST_PX / spec.width, _TALLEST_PX / spec.height)
+    return CameraSpec(
+        round(spec.width * zoom), round(spec.height * zoom), spec.fov_deg, mount=spec.mount, lens=spec.lens
+    )
+
+
+class _Reel:
+    """Collects the moments before one failure."""
+
+    def __init__(self, scenario: Scenario, mishap: Mishap) -> None:
+        self._scenario, self._mishap = scenario, mishap
+        self._first = max(0, mishap.tick - Clock().ticks(SHOWN_S))
+        self._first += (mishap.tick - self._first) % _STEP_TICKS
+        self._pictured = mishap.tick - Clock().ticks(PICTURED_S)
+        self._robot: list[tuple[float, ...]] = []
+        self._streets: list[Street] = []
+        self._at: list[int] = []
+        self._seen: list[str] = []
+        self._followed: list[str] = []
+        self._ahead: Floats = np.zeros(2)
+
+    def take(self, step: Step, eyes: Eyes) -> None:
+        """One tick."""
+        before = self._mishap.tick - step.tick
+        if step.tick < self._first or before < 0:
+            return
+        robot, street = step.motion.robot, step.street_after
+        ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
+        self._ahead = 0.9 * self._ahead + 0.1 * ahead if self._ahead.any() else ahead
+        if before % _STEP_TICKS == 0:
+            self._robot.append((*robot.pose, robot.v_mps, step.command.v_mps, step.command.w_radps))
+            self._streets.append(street)
+        if step.tick >= self._pictured and before % _PICTURE_TICKS == 0:
+            self._at.append(len(self._robot) - 1)
+            self._seen.append(image_url(eyes.render(robot, street).rgb))
+            self._followed.append(self._behind(robot, street, eyes))
+
+    def _behind(self, robot: RobotState, street: Street, eyes: Eyes) -> str:
+        return image_url(eyes.picture(*eye_behind(robot, self._ahead), street, robot, FOLLOW_PX).rgb)
+
+    def showing(self, street_map: StreetMap, size_m: tuple[float, float]) -> ShownAgain:
+        """All of it, around the robot's place at the failure."""
+        track = np.array(self._robot)
+        origin = np.round(track[-1, :2])
+        tracks, names = self._tracks(track, origin)
+        failure = self._mishap.failure
+        hit = names.index(failure.other) if failure is not None and failure.other in names else -1
+        robot = np.column_stack(
+            [100.0 * (track[:, :2] - origin), 1000.0 * track[:, 2], 100.0 * track[:, 3:5], 1000.0 * track[:, 5]]
+        )
+        scene = Scene(
+            step_s=Clock().time_s(_STEP_TICKS),
+            end_s=Clock().time_s(self._mishap.tick + 1),
+            robot=_whole(robot),
+            size=(round(100.0 * size_m[0]), round(100.0 * size_m[1])),
+            tracks=tracks,
+            signals=self._signals(street_map, origin),
+            ground=self._ground(street_map, track[:, :2], origin),
+            route=_ring(self._near(np.array(self._scenario.route), track[-1, :2]), origin),
+            goal=tuple(_ring(np.array([self._scenario.goal]), origin)),  # type: ignore[arg-type]
+            pictures=Pictures(self._at, self._seen, self._followed),
+            hit=hit,
+        )
+        return ShownAgain(scene, None if hit < 0 else _other(track[-1], tracks[hit], origin))
+
+    def _near(self, route: Floats, where: Floats) -> Floats:
+        """The stretch of the route that can be in view."""
+        near = np.flatnonzero(np.hypot(*(route - where).T) < 2.0 * _GROUND_M + SHOWN_S * 2.5)
+        if not len(near):
+            return route
+        return route[max(near[0] - 1, 0) : near[-1] + 2]
+
+    def _tracks(self, track: Floats, origin: Floats) -> tuple[list[Track], list[str]]:
+        """Everybody who came near, while they were; a new track for who comes back."""
+        begun: dict[str, int] = {}
+        rows: dict[tuple[str, int], list[tuple[float, float, float]]] = {}
+        kinds: dict[tuple[str, int], tuple[str, tuple[int, int]]] = {}
+        doing: dict[tuple[str, int], list[tuple[int, str]]] = {}
+        last: dict[str, int] = {}
+        for sample, (street, robot) in enumerate(zip(self._streets, track, strict=True)):
+            people, vehicles = street.people, street.vehicles
+            for i in np.flatnonzero(np.hypot(*(people.xy - robot[:2]).T) < _PEOPLE_M).tolist():
+                name = people.ids[i]
+                if last.get(name) != sample - 1:
+                    begun[name] = sample
+                last[name] = sample
+                key = name, begun[name]
+                rows.setdefault(key, []).append((*people.xy[i], people.heading[i]))
+                kinds[key] = PersonKind(people.kind[i]).name.lower(), (60, 60)
+                said = doing.setdefault(key, [])
+                if not said or said[-1][1] != people.doing[i]:
+                    said.append((sample, people.doing[i]))
+            for i in np.flatnonzero(np.hypot(*(vehicles.xy - robot[:2]).T) < _VEHICLES_M).tolist():
+                name = vehicles.ids[i]
+                if last.get(name) != sample - 1:
+                    begun[name] = sample
+                last[name] = sample
+                key = name, begun[name]
+                rows.setdefault(key, []).append((*vehicles.xy[i], vehicles.heading[i]))
+                kinds[key] = "vehicle", (round(100.0 * vehicles.size[i, 0]), round(100.0 * vehicles.size[i, 1]))
+        tracks, names = [], []
+        for (name, first), at in rows.items():
+            kind, size = kinds[name, first]
+            moved = np.array(at)
+            whole = _whole(np.column_stack([100.0 * (moved[:, :2] - origin), 1000.0 * moved[:, 2]]))
+            tracks.append(Track(kind, first, whole, size, doing.get((name, first), [])))
+            names.append(name if last[name] == first + len(at) - 1 else "")
+        return tracks, names
+
+    def _signals(self, street_map: StreetMap, origin: Floats) -> list[CrossingLight]:
+        found = []
+        for crossing in self._scenario.crossings:
+            if crossing.signalised:
+                lights = [street.signals.get(crossing.id) for street in self._streets]
+                states = "".join("-" if light is None else "g" if light.walk else "r" for light in lights)
+                if states.strip("-"):
+                    found.append(CrossingLight(_ring(street_map.strips[crossing.id].line[:, :2], origin), states))
+        return found
+
+    def _ground(self, street_map: StreetMap, way: Floats, origin: Floats) -> list[tuple[str, list[Outline]]]:
+        (x0, y0), (x1, y1) = (way.min(axis=0) - _GROUND_M).tolist(), (way.max(axis=0) + _GROUND_M).tolist()
+        area = shapely.box(x0, y0, x1, y1)
+        shapes = [*street_areas(street_map, area)]
+        for barrier in self._scenario.barriers:
+            along = np.array([-math.sin(barrier.heading_rad), math.cos(barrier.heading_rad)]) * barrier.length_m / 2
+            middle = np.array([barrier.x_m, barrier.y_m])
+            shapes.append(("barrier", shapely.LineString([middle - along, middle + along]).buffer(0.12)))
+        shapes += [("obstacle", footprint(obstacle)) for obstacle in self._scenario.obstacles]
+        found: list[tuple[str, list[Outline]]] = []
+        for kind, shape in shapes:
+            parts = shapely.get_parts(shapely.simplify(shapely.intersection(shape, area), 0.03))
+            polygons = [part for part in parts if isinstance(part, shapely.Polygon) and not part.is_empty]
+            found += [
+                (kind, [_ring(np.array(ring.coords), origin) for ring in (p.exterior, *p.interiors)]) for p in polygons
+            ]
+        return found
+
+
+def _other(robot: Floats, track: Track, origin: Floats) -> Other:
+    """Where who was met is at the end, and its velocity. robot: (6,) of the last sample."""
+    at = np.array(track.at, dtype=float).reshape(-1, 3)[-_OVER_SAMPLES - 1 :]
+    xy = at[:, :2] / 100.0 + origin
+    span_s = Clock().time_s(_STEP_TICKS) * (len(xy) - 1)
+    velocity = (xy[-1] - xy[0]) / span_s if span_s else np.zeros(2)
+    return Other.seen_from(robot[:3], xy[-1], velocity)
+
+
+def _whole(values: Floats) -> list[int]:
+    return [int(value) for value in np.round(values).ravel()]
+
+
+def _ring(xy: Floats, origin: Floats) -> Outline:
+    return _whole(100.0 * (xy[:, :2] - origin))
+
+
+def image_url(rgb: Image, quality: int = _QUALITY) -> str:
+    """A picture as it stands in a page."""
+    coded = cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
+    return "data:image/webp;base64," + base64.b64encode(coded.tobytes()).decode()

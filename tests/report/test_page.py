@@ -1,0 +1,232 @@
+"""The page of `cosim report`: figures, choice, escapes, bad input; no engine, no browser."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.state import Age, PersonKind
+from cosim.records.results import summary_of
+from cosim.records.run_folder import RunFolder, read_spec
+from cosim.report.page.choice import most_telling, shown_of
+from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
+from cosim.report.page.plots import exposure_of, near_of, plots_of
+from cosim.report.page.runs import read_runs
+from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.report.page.three_tables import tables_html
+from cosim.spec.scenario import read_suite
+from tests.conftest import ROOT, Cosim
+from tests.records.driven_runs import HIT, episode_of, failure_at, run_of, short_way
+
+PAPER = Path(os.environ.get("COSIM_SHARED", ROOT.parent / "shared")) / "paper/sidewalkbench.tex"
+HOSTILE = '</script><script>document.title="taken"</script><img src=x onerror=document.title="taken">'
+
+
+def page(*folders: Path, entries: tuple[Entry, ...] = (), maps: Maps | None = None) -> str:
+    """The page of runs, with nothing shown again."""
+    runs = read_runs(folders)
+    maps = maps or Maps([], {}, dict(counts_of(runs)))
+    return page_of(runs, plots_of(runs, colours_of(runs)), entries, maps, "").decode()
+
+
+class Elements(HTMLParser):
+    """Counts elements, and keeps what scripts of JSON hold."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.data: list[object] = []
+        self._json = False
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self._json = ("type", "application/json") in attrs
+
+    def handle_data(self, data: str) -> None:
+        if self._json:
+            self.data.append(json.loads(data))
+            self._json = False
+
+
+def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
+    """Success of straight ways, with its interval, stands in the row of the policy; the paper's rows are marked."""
+    run = run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")
+    (told,) = read_runs([run])
+    mean, low, high, _ = summary_of(told.table, ["success"]).iloc[0]
+    text = tables_html([told])
+    (row,) = re.findall(r'<tr><th scope="row">mine.*?</tr>', text)
+    assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in row and mean == 0.6
+    assert text.index("the paper's models, in another engine") < text.index("OpenPilot")
+    assert text.count('class="paper"') == len(UNIT_OF_PAPER)
+
+
+@pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")
+def test_the_papers_figures_are_those_of_its_tables() -> None:
+    """Every row of ours is what stands in the table of the paper's source, figure by figure."""
+    text = PAPER.read_text()
+
+    def row(table: str, name: str, nth: int = 0) -> tuple[float | None, ...]:
+        part = text.split(rf"\label{{{table}}}")[0].split(r"\begin{table}")[-1]
+        found = re.findall(rf"{name}~\\cite{{[^}}]*}}(.*?)\\\\", part)[nth]
+        cells = [re.sub(r"\\textbf|\\cellcolor{\w+}|[{}\s]", "", cell) for cell in found.split("&")[1:]]
+        return tuple(None if cell == "--" else float(cell) for cell in cells)
+
+    for name in UNIT_OF_PAPER:
+        assert row("tab:terrain_only", name) == UNIT_OF_PAPER[name]
+        assert row("tab:long_horizon", name) == LONG_OF_PAPER[name]
+        assert row("tab:hand_crafted", name) == REACTIVE_OF_PAPER["success"][name]
+        assert (None, *row("tab:hand_crafted_full", name, 0)) == REACTIVE_OF_PAPER["pedestrian_collision"][name]
+        apart = REACTIVE_OF_PAPER["pedestrian_distance_min_success_m"][name]
+        assert (None, *row("tab:hand_crafted_full", name, 1)) == apart
+
+
+def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_path: Path) -> None:
+    """Of many failures of few kinds one of each is chosen first, the earliest; the bound holds."""
+    kinds = [("straight", "curve", "crosswalk")[i % 3] for i in range(27)]
+    ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
+    runs = read_runs([run_of(tmp_path / "run", [HIT] * 27, "mine", ways)])
+    candidates = shown_of(runs)
+    picked = most_telling(candidates, 3)
+    assert len(candidates) == 27 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
+    assert len(most_telling(candidates, 48)) == 24 and len({one.scenario for one in most_telling(candidates, 48)}) == 24
+
+
+def test_a_failure_counts_where_so_many_people_were_near() -> None:
+    """Two people within 10 m in the second of the failure: it and that second's metres are in their bin."""
+    way = short_way("s-000", ends_on_failure=False)
+    record, log = episode_of(way, "h", HIT)
+    assert log is not None
+    seen = np.array([0, 20, 40, 60, 60])
+    xy = np.column_stack([log.pose[seen, 0] + [50.0, 50.0, 50.0, 3.0, -3.0], np.zeros(5)])
+    kinds = {"people_kind": np.full(5, PersonKind.CROWD), "people_age": np.full(5, Age.ADULT)}
+    log = type(log)(**{**vars(log), "people_tick": seen, "people_xy": xy, **kinds})
+    near = near_of(log)
+    assert near[59] == 0.0 and near[60] == near[79] == 2.0
+    record = msgspec.structs.replace(record, failures=(failure_at(log, 70), failure_at(log, 75, "freezing")))
+    exposure = exposure_of(record, log, near, (1.0, 3.0), moving=False)
+    assert exposure.failures.tolist() == [0.0, 2.0, 0.0]
+    assert exposure.metres.sum() == pytest.approx(log.travelled_m.sum()) and exposure.metres[1] == pytest.approx(1.0)
+    assert exposure_of(record, log, near, (1.0, 3.0), moving=True).failures.tolist() == [0.0, 1.0, 0.0]
+
+
+def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:
+    """A structure, a policy and a reason that are markup are seen as they are: no element comes of them."""
+    plain, hostile = (
+        Elements(page(folder, entries=(entry,), maps=maps))
+        for folder, entry, maps in (_named(tmp_path / "plain", "plain"), _named(tmp_path / "hostile", HOSTILE))
+    )
+    assert hostile.tags == plain.tags and "script" in plain.tags
+    assert HOSTILE in json.dumps(hostile.data[0]).replace('\\"', '"')
+    assert len(hostile.data) == len(plain.data) == 1
+
+
+def _named(path: Path, name: str) -> tuple[Path, Entry, Maps]:
+    """A run in which everything that can be named is called so, and a card and a map of it."""
+    ways = [short_way("s-000", structure=name), short_way("s-001", structure=f"{name} 2")]
+    run = run_of(path, [HIT, "goal"], name, ways)
+    entry = Entry(
+        label=name, suite="s", scenario="s-000", kind=name, event=name, place=name, light="fog", cause="obstacle",
+        reason=name, at_s=4.0, why=name,
+    )  # fmt: skip
+    picture = PlacePicture(place=name, image="data:image/webp;base64,", bounds=(0.0, 0.0, 1.0, 1.0))
+    return run, entry, Maps([picture], {name: [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words=name)]}, {name: (1, 1)})
+
+
+def test_the_page_is_one_file_that_loads_nothing(tmp_path: Path) -> None:
+    """Its policy forbids every address, and no element names one."""
+    text = page(run_of(tmp_path / "run", [HIT, "goal"]))
+    assert "content=\"default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src" in text
+    head = re.sub(r"<script>.*?</script>", "", text, flags=re.DOTALL)
+    assert not re.findall(r'(?:src|href)="(?!#|data:)[^"]*"', head) and "<link" not in head
+
+
+def test_two_runs_of_one_policy_and_suite_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    """One run of a policy is called as the policy, two as their folders."""
+    first, second = run_of(tmp_path / "first", ["goal"], "mine"), run_of(tmp_path / "second", [HIT], "mine")
+    assert [run.label for run in read_runs([first])] == ["mine"]
+    assert [run.label for run in read_runs([first, second])] == ["first", "second"]
+
+
+def _truncated(run: Path) -> str:
+    file = run / "episodes/s-000/record.json"
+    file.write_bytes(file.read_bytes()[:200])
+    return "episodes/s-000/record.json"
+
+
+def _truncated_trajectory(run: Path) -> str:
+    file = run / "episodes/s-000/trajectory.npz"
+    file.write_bytes(file.read_bytes()[:200])
+    return "episodes/s-000/trajectory.npz"
+
+
+def _edited(run: Path) -> str:
+    file = run / "scenarios.json"
+    file.write_text(file.read_text().replace('"time_limit_s":12.0', '"time_limit_s":13.0'))
+    return "scenarios.json"
+
+
+@pytest.mark.parametrize("damage", [_truncated, _truncated_trajectory, _edited], ids=["record", "trajectory", "suite"])
+def test_a_damaged_run_is_refused_by_the_name_of_its_file(
+    tmp_path: Path, cosim: Cosim, damage: Callable[[Path], str]
+) -> None:
+    """One line with the file and the remedy, exit code 2, and no page."""
+    run = run_of(tmp_path / "run", [HIT, "goal"])
+    file = damage(run)
+    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    (line,) = [line for line in said.stderr.splitlines() if line.startswith("error:")]
+    assert said.returncode == 2 and file in line and "again" in line
+    assert not list(tmp_path.glob("*.html*"))
+
+
+def test_no_run_a_run_twice_and_a_run_without_an_episode_are_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """Each in one line that says what to do."""
+    run = run_of(tmp_path / "run", [HIT])
+    with RunFolder.create(tmp_path / "empty", read_spec(run), read_suite(run / "scenarios.json")) as held:
+        assert "in use by process" in cosim("report", str(held.path), "-o", "r.html", cwd=tmp_path).stderr
+    words = {
+        ("nowhere",): "unknown run",
+        ("run", "../" + tmp_path.name + "/run"): "is given twice: name each run once",
+        ("empty",): "no episode of it has ended",
+    }
+    for folders, expected in words.items():
+        said = cosim("report", *folders, "-o", "r.html", cwd=tmp_path)
+        assert said.returncode == 2 and expected in said.stderr, said.stderr
+    assert not list(tmp_path.glob("*.html*"))
+
+
+def test_two_suites_of_one_name_do_not_stand_in_one_table(tmp_path: Path, cosim: Cosim) -> None:
+    """The line names both folders and both hashes."""
+    run_of(tmp_path / "one", [HIT], "mine")
+    run_of(tmp_path / "two", [HIT], "mine", [short_way("s-000", time_limit_s=20.0)])
+    said = cosim("report", "one", "two", "-o", "r.html", cwd=tmp_path)
+    assert said.returncode == 2 and re.search(
+        r"two and one are of different suites 's' \(\w{16}, \w{16}\)", said.stderr
+    )
+
+
+def test_a_full_disk_leaves_nothing_half_written(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The page that was there before stays, nothing lies beside it; exit code 3."""
+    run_of(tmp_path / "run", ["goal", "goal"])
+    (tmp_path / "report.html").write_text("the page before")
+    from scenarios.viewing import report
+
+    def full(path: Path, data: bytes) -> None:
+        path.with_name(path.name + ".part").write_bytes(data[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(report, "write_whole", full)
+    said = cosim("report", "run", "-o", "report.html", cwd=tmp_path)
+    assert said.returncode == 3 and "report.html: cannot be written: No space left" in said.stderr
+    assert [path.name for path in tmp_path.glob("report*")] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "the page before"

@@ -1,0 +1,128 @@
+"""The page of `cosim report` in a browser: it opens from disk, every failure plays, on a desk, a phone and paper."""
+
+from __future__ import annotations
+
+import base64
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.chromium import CHROMIUM, Page, chromium
+from tests.conftest import Cosim
+
+pytestmark = [
+    pytest.mark.engine,
+    pytest.mark.skipif(CHROMIUM is None and "CI" not in os.environ, reason="no Chromium here"),
+]
+PICTURED = (
+    "document.querySelector('#by-robot').naturalWidth > 0 && document.querySelector('#from-behind').naturalWidth > 0"
+)
+DRAWN = "document.querySelector('#above').toDataURL()"
+WIDE = "document.documentElement.scrollWidth"
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
+    """The report of a run of two scenarios that a blind policy fails."""
+    folder = tmp_path_factory.mktemp("report")
+    words = ("--policy", "tests.report.blind:Blind", "--scenario", "lateral-001", "--scenario", "obstructing-001")
+    done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    done = cosim("report", "run", "--jobs", "1", "-o", "report.html", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "2 of 2 failures" in done.stdout
+    return folder / "report.html"
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Page]:
+    with chromium() as page:
+        yield page
+
+
+@pytest.fixture
+def page(report: Path, browser: Page) -> Iterator[Page]:
+    """The report, opened on a desk. Afterwards nothing was wrong with it, and nobody was asked for anything."""
+    browser.size(1280, 900)
+    browser.open(report)
+    yield browser
+    assert browser.wrong == []
+    assert browser.asked == []
+
+
+def test_every_failure_plays_to_its_end(page: Page) -> None:
+    """Play runs until the moment of the failure; the picture from above and both cameras change on the way."""
+    cards = page.js("document.querySelectorAll('[data-entry]').length")
+    assert cards == 2
+    page.js("window.setInterval = ((real) => (what, ms) => real(what, ms / 25))(window.setInterval); 0")
+    for number in range(cards):
+        page.js(f"document.querySelector('[data-entry=\"{number}\"]').click()")
+        page.until(PICTURED)
+        began = [page.js(what) for what in (DRAWN, "document.querySelector('#by-robot').src")]
+        page.js("document.querySelector('#play').click()")
+        page.until("document.querySelector('#scrub').value === document.querySelector('#scrub').max")
+        page.until("document.querySelector('#play').textContent === 'Play'")
+        page.until(PICTURED)
+        ended = [page.js(what) for what in (DRAWN, "document.querySelector('#by-robot').src")]
+        assert all(before != after for before, after in zip(began, ended, strict=True))
+        assert page.js("document.querySelector('#clock').textContent") == "the failure"
+        page.key("Escape", code=27)
+    reasons = page.js("[...document.querySelectorAll('.card b')].map((b) => b.textContent)")
+    assert any("who came from the" in reason and "after the trigger" in reason for reason in reasons)
+    assert any("who stood ahead" in reason for reason in reasons)
+
+
+def test_the_viewer_is_worked_by_keys_alone(page: Page) -> None:
+    """Enter opens, arrows step, End goes to the failure, Shift and arrow to another, Escape closes."""
+    page.js("document.querySelector('[data-entry=\"0\"]').focus()")
+    page.key("Enter", code=13)
+    page.until("document.querySelector('#viewer').open")
+    value = "Number(document.querySelector('#scrub').value)"
+    page.key("ArrowRight", code=39)
+    page.key("ArrowRight", code=39)
+    assert page.js(value) == 2
+    page.key("End", code=35)
+    assert page.js(value) == page.js("Number(document.querySelector('#scrub').max)")
+    reason = "document.querySelector('#viewer-reason').textContent"
+    before = page.js(reason)
+    page.key("ArrowRight", shift=True, code=39)
+    assert page.js(reason) != before and page.js(value) == 0
+    page.key(" ", code=32)
+    page.until(f"{value} > 0")
+    page.key("Escape", code=27)
+    page.until("!document.querySelector('#viewer').open")
+
+
+def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
+    """At 400 px nothing is wider than the screen, but for tables that scroll in themselves; it prints."""
+    assert page.js(WIDE) <= 1280
+    page.size(400, 850, phone=True)
+    page.until(f"{WIDE} <= 400 && document.querySelector('.main-svg').clientWidth <= 400")
+    page.js("document.querySelector('[data-entry=\"0\"]').click()")
+    page.until(PICTURED)
+    assert page.js("document.querySelector('#viewer').scrollWidth") <= 400
+    page.key("Escape", code=27)
+    printed = base64.b64decode(page.call("Page.printToPDF", printBackground=True)["data"])
+    assert printed.startswith(b"%PDF") and len(printed) > 20_000
+
+
+def test_plots_and_maps_are_drawn(page: Page) -> None:
+    """Every plot has marks in it, the map of the chosen place its failures, and a click on one opens it."""
+    plots = page.js("document.querySelectorAll('[data-plot]').length")
+    marks = "[...document.querySelectorAll('[data-plot]')].filter((p) => p.querySelector('.point, .bars path')).length"
+    assert plots and page.js(marks) == plots
+    page.until("document.querySelectorAll('#map .points path').length > 0")
+    assert page.js("document.querySelectorAll('#map image').length") == 1
+    places = page.js("document.querySelectorAll('#place option').length")
+    assert places == page.js("document.querySelectorAll('#places tbody tr').length") > 0
+
+
+def test_filters_show_what_was_asked_for(page: Page) -> None:
+    """One kind chosen: its cards alone, and how many of how many."""
+    page.js("const kind = document.querySelector('[data-field=kind]'); kind.value = 'lateral'; 0")
+    page.js("document.querySelector('[data-field=kind]').dispatchEvent(new Event('change'))")
+    shown = page.js("[...document.querySelectorAll('.cards > li')].filter((c) => !c.hidden).map((c) => c.dataset.kind)")
+    assert shown == ["lateral"]
+    assert page.js("document.querySelector('#shown').textContent") == "1 of 2 shown"
