@@ -18,7 +18,7 @@ from cosim.core.errors import CosimError, unwritable
 from cosim.core.telling import Tell, untold
 from cosim.core.whole_file import write_whole
 from cosim.report.above import ROUTE, Sheet, draw_streets
-from cosim.report.page.choice import MOST_FAILURES, Shown, most_telling, shown_of
+from cosim.report.page.choice import MOST_FAILURES, FailureToShow, most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.plots import plots_of
 from cosim.report.page.reasons import mishaps_of, reason_of
@@ -90,7 +90,11 @@ def make_report(
 
 
 def _showings(
-    pool: ProcessPoolExecutor, runs: Sequence[ReportedRun], picks: Sequence[Shown], camera: CameraChoice, tell: Tell
+    pool: ProcessPoolExecutor,
+    runs: Sequence[ReportedRun],
+    picks: Sequence[FailureToShow],
+    camera: CameraChoice,
+    tell: Tell,
 ) -> list[ShownAgain | str]:
     """Every pick shown again, or why it could not be. The longest replays begin first."""
     episodes: dict[tuple[int, str], list[int]] = {}
@@ -125,7 +129,7 @@ def _outcome(future: Future[_T]) -> _T | str:
         return "the process that ran it again died"
 
 
-def _entry(run: ReportedRun, pick: Shown, showing: ShownAgain | str) -> Entry:
+def _entry(run: ReportedRun, pick: FailureToShow, showing: ShownAgain | str) -> Entry:
     scenario = run.scenarios[pick.scenario]
     record = run.whole.records[pick.scenario]
     other = None if isinstance(showing, str) else showing.other
@@ -197,7 +201,7 @@ def _place_picture(
     return PlacePicture(place=name, image=image_url(sheet.image, _MAP_QUALITY), bounds=bounds)
 
 
-def _spots(runs: Sequence[ReportedRun], picks: Sequence[Shown]) -> dict[str, list[Spot]]:
+def _spots(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> dict[str, list[Spot]]:
     """Where everything went wrong, by place."""
     numbers = {(pick.run, pick.scenario, pick.mishap): k for k, pick in enumerate(picks)}
     spots: dict[str, list[Spot]] = {}

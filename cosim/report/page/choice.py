@@ -16,7 +16,7 @@ _OF_AN_EPISODE: Final = 40
 """Later failures of one long way are not looked at: to come there takes long."""
 
 
-class Shown(NamedTuple):
+class FailureToShow(NamedTuple):
     """A failure that may be shown. run: its number; event: of its event, "" without; facets: what it is an example of;
     place: where."""
 
@@ -28,7 +28,7 @@ class Shown(NamedTuple):
     place: str
 
 
-def shown_of(runs: Sequence[ReportedRun]) -> list[Shown]:
+def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
     """Every failure that can be shown again: of episodes that came to their end."""
     found = []
     for number, run in enumerate(runs):
@@ -45,15 +45,17 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[Shown]:
                 if isinstance(scenario.place, CityMap):
                     facets.add(scenario.place.map)
                 words = "" if event is None else event.kind
-                found.append(Shown(number, record.scenario, mishap, words, frozenset(facets), place_in_words(scenario)))
+                found.append(
+                    FailureToShow(number, record.scenario, mishap, words, frozenset(facets), place_in_words(scenario))
+                )
     return found
 
 
-def most_telling(candidates: Sequence[Shown], most: int = MOST_FAILURES) -> list[Shown]:
+def most_telling(candidates: Sequence[FailureToShow], most: int = MOST_FAILURES) -> list[FailureToShow]:
     """The most telling ones, the most telling first: each adds as many facets as it can, then a new place, and comes
     early in its episode. Stops when there is nothing new, but not below LEAST_FAILURES."""
     left = sorted(candidates, key=lambda one: (one.mishap.tick, one.scenario, one.run))
-    picked: list[Shown] = []
+    picked: list[FailureToShow] = []
     seen: set[Hashable] = set()
     places: set[str] = set()
     episodes: set[tuple[int, str]] = set()
