@@ -42,6 +42,7 @@ def contradictions(record: Record, scenario: Scenario, log: Log) -> Iterator[Con
         yield Contradiction("latency_ms", record.latency_ms, latency_ms)
     yield from _failures_as_driven(record, log)
     yield from _resets(record, scenario, log)
+    yield from _red_entries(record, scenario, log)
     yield from _way(scenario, log)
     yield from _freezings(record, scenario, log)
     if record.ended not in (ends := _ends(record, scenario, log)):
@@ -65,6 +66,15 @@ def _resets(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradict
     if failed != resets:
         k = min({*failed} ^ {*resets})
         yield Contradiction(f"failures at tick {k}", int(k in failed), int(k in resets))
+
+
+def _red_entries(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
+    """Whatever the signal showed, the robot was on the crossing then."""
+    crossings = {crossing.id: crossing for crossing in scenario.crossings}
+    for entry in record.red_light_entries:
+        crossing, s_m = crossings.get(entry.crossing), [*log.route_s_m[entry.tick : entry.tick + 1].tolist()]
+        if crossing is None or not s_m or not crossing.enter_s_m < s_m[0] < crossing.leave_s_m:
+            yield Contradiction(f"red_light_entries at tick {entry.tick}", entry.crossing, f"at {s_m} m of the route")
 
 
 def _way(scenario: Scenario, log: Log) -> Iterator[Contradiction]:

@@ -32,7 +32,7 @@ from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
 METRIC_SCHEMA = 3
-"""Raised whenever a definition of `cosim.judge.metrics` changes; measures of different schemas are not compared."""
+"""Raised whenever a definition of `cosim.judge.metrics` comes or changes; other schemas are not compared with it."""
 NO_RENDERER = "none"
 """The renderer of an episode whose policy has no camera."""
 

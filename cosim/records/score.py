@@ -9,7 +9,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -20,7 +20,7 @@ from cosim.core.telling import Tell, untold
 from cosim.episode.log import Log
 from cosim.judge.event_monitor import why_invalid
 from cosim.judge.evidence import contradictions
-from cosim.judge.metrics import COUNTERFACTUAL, EpisodeFacts, every_metric
+from cosim.judge.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
 from cosim.records.run_folder import DATABASE, read_rows
@@ -107,7 +107,7 @@ def _rows_that_differ(path: Path, computed: list[Record]) -> Iterator[Difference
     rows = read_rows(path)
     for record in computed:
         told, follows = rows[record.scenario], json.loads(json.dumps(table_row(record)))
-        for name in dict.fromkeys([*follows, *told]):
+        for name in _looked_at(follows, told):
             if repr(told.get(name)) != repr(follows.get(name)):
                 yield Difference(DATABASE, record.scenario, name, repr(told.get(name)), repr(follows.get(name)))
 
@@ -124,8 +124,15 @@ def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Differenc
     )
     if not theirs.keys() <= mine.keys() or not theirs:
         raise RunError(f"{file}: not the table of this run: remove it, and give the command of the run with --resume")
+    columns = next(iter(theirs.values()))
     for name, row in mine.items():
         other = theirs.get(name, {})
-        for column, value in row.items():
+        for column in _looked_at(row, columns):
+            value = row[column]
             if other.get(column) != value:
                 yield Difference(file.name, name, column, other.get(column) or "nothing", value or "nothing")
+
+
+def _looked_at(follows: Mapping[str, object], told: Container[str]) -> list[str]:
+    """All metrics, and of the other columns those that the run's version had."""
+    return [name for name in follows if name in METRICS or name in told]
