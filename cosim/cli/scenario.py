@@ -16,6 +16,7 @@ from cosim.cli.board import Board
 from cosim.cli.consoles import err, out
 from cosim.cli.eyes import CAMERA_HELP, Choice, camera_here
 from cosim.cli.progress import doing
+from cosim.core.box import box_of
 from cosim.core.errors import (
     INTERRUPTED,
     SOME_CRASHED,
@@ -92,13 +93,15 @@ def check_own(files: Annotated[list[Path], typer.Argument(metavar="FILE...", hel
 @scenario_app.command(
     "draw",
     epilog="Examples:  \n`cosim scenario draw mine.toml -o map.png`  \n"
-    "`cosim scenario draw mine.toml --whole -o town.png`",
+    "`cosim scenario draw mine.toml --whole -o town.png`  \n"
+    "`cosim scenario draw mine.toml --zoom 300,1700,500,1900 -o part.png`",
 )
 def draw_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
     picture: Annotated[Path, typer.Option("-o", "--output", help="The picture, a PNG.")],
     scenario: Annotated[str | None, typer.Option(help="Of a sweep, which one; by default the first.")] = None,
     whole: Annotated[bool, typer.Option("--whole", help="The whole place, also where there is no way yet.")] = False,
+    zoom: Annotated[str | None, typer.Option(help="Part of the place: x0,y0,x1,y1 in metres.")] = None,
 ) -> None:
     """Draw the map from above: coordinates, way, metres along it, fences, obstacles, events."""
     from cosim.report.mapsheet import write_png
@@ -107,6 +110,7 @@ def draw_own(
     from scenarios.own.making import made_one, place_of_own
     from scenarios.own.reading import read_own
 
+    part = None if zoom is None else box_of("--zoom", zoom)
     own = read_own(file)
     variants = {variant.id: variant for variant in own.variants}
     if scenario is not None and scenario not in variants:
@@ -114,14 +118,16 @@ def draw_own(
     variant = variants[scenario] if scenario else own.variants[0]
     with doing(f"drawing {variant.id}"):
         made = made_one(variant, own.name)
-        if made.scenario is None and not whole:
+        if made.scenario is None and not whole and part is None:
             faults = "\n  ".join(made.faults)
             raise SpecError(f"{file}: {faults}\n  --whole draws the place alone, to find a way on it")
         _, street_map = place(place_of_own(variant.own.place) if made.scenario is None else made.scenario.place)
-        write_png(draw_plan(street_map, made.scenario, whole=whole), picture)
+        write_png(draw_plan(street_map, made.scenario, whole=whole, part=part), picture)
     for fault in made.faults:
         err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
     out.print(f"Picture: {picture}", soft_wrap=True)
+    if made.faults:
+        raise typer.Exit(WRONG_USE)
 
 
 @scenario_app.command(
@@ -246,14 +252,15 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
     from scenarios.own.along import narrow_events
     from scenarios.own.ways import moved_m
 
-    heads = ("scenario", "hash", "way\nm", "cross-\nings", "events", "obst-\nacles", "people", "limit\ns")
+    short = f"{own.name}-" if len(own.variants) > 1 else ""
+    heads = (short or "scenario", "hash", "way\nm", "cross-\nings", "events", "obst-\nacles", "people")
     first, *others = (Column(head, no_wrap=head != heads[0], overflow="fold") for head in heads)
     shown = Table(first, *others, box=box.SIMPLE_HEAD, padding=0)
     for one in suite.scenarios:
         people = f"{one.crowd.density:g}/1000m2" if one.crowd.density is not None else str(one.crowd.persons)
         counts = (str(len(there)) for there in (one.crossings, one.events, one.obstacles))
         length = f"{one.route_line.length_m:.1f}"
-        shown.add_row(one.id, content_hash(one), length, *counts, people, f"{one.time_limit_s:g}")
+        shown.add_row(one.id.removeprefix(short), content_hash(one), length, *counts, people)
     out.print(shown)
     pairs = zip(own.variants, suite.scenarios, strict=True)
     for name, far_m in dict.fromkeys(end for variant, one in pairs for end in moved_m(variant.own.way, one)):
@@ -261,4 +268,7 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
             out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
     for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
         out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
-    out.print(f"on {', '.join(sorted({one.place.name for one in suite.scenarios}))}; suite hash {suite.content_hash}")
+    where = ", ".join(sorted({one.place.name for one in suite.scenarios}))
+    least_s, most_s = (end(one.time_limit_s for one in suite.scenarios) for end in (min, max))
+    limits = f"{least_s:g}" if least_s == most_s else f"{least_s:g} to {most_s:g}"
+    out.print(f"on {where}; time limit {limits} s; suite hash {suite.content_hash}", soft_wrap=True)

@@ -28,8 +28,8 @@ from cosim.spec.scenario import Scenario
 _GRID: Final[Rgb255] = (160, 172, 186)
 _INK: Final[Rgb255] = (70, 84, 104)
 _STEPS_M: Final = (1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0)
-_LINES: Final = 10
-"""The grid has so many lines across the picture, at most."""
+_LINES, _LINES_OF_ALL = 10, 25
+"""The grid has so many lines across the picture, at most, and across that of a whole place or a part of one."""
 _MARGIN_M: Final = 12.0
 _LEAST_SHARE: Final = 0.6
 """The shorter side of a picture is this much of the longer, about."""
@@ -38,12 +38,17 @@ _BETWEEN_PX: Final = 60.0
 _Bounds = tuple[float, float, float, float]
 
 
-def draw_plan(street_map: StreetMap, scenario: Scenario | None, *, whole: bool = False) -> Image:
-    """The picture of a scenario, (H, W, 3) uint8 RGB. whole: of its whole place; None: of the place alone."""
-    bounds = _around(street_map.bounds) if whole or scenario is None else _around(_ends(scenario))
-    sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / max(bounds[2] - bounds[0], bounds[3] - bounds[1])))
+def draw_plan(
+    street_map: StreetMap, scenario: Scenario | None, *, whole: bool = False, part: _Bounds | None = None
+) -> Image:
+    """The picture of a scenario, (H, W, 3) uint8 RGB; None: of the place alone. whole: of its whole place; part: what
+    lies within x0, y0, x1, y1 (metres) of it."""
+    bounds = part or _around(street_map.bounds if whole or scenario is None else _ends(scenario))
+    lines = _LINES_OF_ALL if part or whole or scenario is None else _LINES
+    longest_m = max(bounds[2] - bounds[0], bounds[3] - bounds[1])
+    sheet = Sheet(bounds, max(PX_PER_M, USUAL_PX / longest_m))
     draw_streets(sheet, street_map, shapely.box(*bounds))
-    step_m = next(step for step in _STEPS_M if max(bounds[2] - bounds[0], bounds[3] - bounds[1]) <= step * _LINES)
+    step_m = next((step for step in _STEPS_M if longest_m <= step * lines), _STEPS_M[-1])
     for strip in street_map.near("strip", shapely.box(*bounds)):
         if isinstance(strip, Strip) and strip.signalised:
             sheet.line(strip.line[:, :2], SIGNAL, 0.5)

@@ -38,7 +38,7 @@ def event_along(number: int, asked: OwnEvent, scenario: Scenario, street_map: St
         if not spots:
             raise SpecError(
                 f"'{kind.name}' needs a crossing without signals, 5 to 12 m long, that the way leads straight over, "
-                'and there is none: give way.signals = "without", or another way'
+                "and there is none: give another start and goal, or route, or a way of kind 'crosswalk'"
             )
         at_m = route.length_m / 2 if asked.at_m is None else asked.at_m
         spot = min(spots, key=lambda one: abs(one.s_m - at_m))

@@ -25,7 +25,9 @@ def own_faults(file: OwnFile, tell: Tell = untold) -> list[str]:
     """Everything that is against driving the scenarios of a file, each fault once, in the order of the scenarios."""
     found: dict[str, None] = {}
     for made in made_of(file, tell):
-        told = made.faults if made.scenario is None else tuple(_faults_on_the_street(made.scenario))
+        told = made.faults
+        if made.scenario is not None and not told:
+            told = tuple(_faults_on_the_street(made.scenario))
         named = f"scenario '{made.variant.id}': "
         found |= dict.fromkeys(fault.replace(named, "").removeprefix(named) for fault in told)
     return list(found)

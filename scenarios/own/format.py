@@ -13,7 +13,7 @@ from cosim.core.errors import SpecError
 from cosim.place.map_check import ROUTE_M
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.obstacle import OBSTACLE_VARIANTS, Obstacle, ObstacleKind
-from cosim.spec.ranges import ALONG_M, SEED, Named, Ranged, Text, Within
+from cosim.spec.ranges import ALONG_M, SEED, WHERE_M, Named, Points, Ranged, Text, Within
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Light
 
@@ -42,8 +42,8 @@ class OwnPlace(Ranged, frozen=True, kw_only=True):
     city: Annotated[int | None, SEED] = None
     size_m: float = 1000.0
     style: str = "mixed"
-    map: str = ""
-    file: str = ""
+    map: Annotated[str, Text(200)] = ""
+    file: Annotated[str, Text(1000)] = ""
     roughness: Annotated[float, Within(0, 1)] = 0.0
 
     @property
@@ -67,7 +67,7 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
     length_m: float | None = None
     start: PointXY | None = None
     goal: PointXY | None = None
-    route: tuple[PointXY, ...] = ()
+    route: Annotated[tuple[PointXY, ...], Points(WHERE_M.low, WHERE_M.high)] = ()
     fences: bool = False
     signals: Literal["any", "with", "without"] = "any"
 
@@ -82,11 +82,17 @@ class OwnWay(Ranged, frozen=True, kw_only=True):
             yield f"way: give one of kind, start and goal, route, not {', '.join(map(str, given)) or 'none'}"
         elif len(points) == 1:
             yield f"way: start and goal go together; {'goal' if points == ['start'] else 'start'} is missing"
+        for name in points:
+            for k, where_m in enumerate(getattr(self, name)):
+                yield WHERE_M.refusal(f"way {name}[{k}]", where_m)
+        if len(self.route) == 1 or (self.route and len(set(self.route)) == 1):
+            yield "way route needs two different points or more"
         lengths = {"straight": STRAIGHT_M, "route": ROUTE_M}
-        if self.length_m is not None and self.kind not in lengths:
-            yield f"way length_m is for ways of kind 'straight' and 'route', not {self.kind or given[0]!r}"
-        elif self.length_m is not None and self.kind is not None:
+        if self.length_m is not None and self.kind in lengths:
             yield Within(*lengths[self.kind]).refusal(f"way length_m of kind '{self.kind}'", self.length_m)
+        elif self.length_m is not None and len(given) == 1:
+            what = f"one of kind '{self.kind}'" if self.kind else f"one by {given[0]}"
+            yield f"way length_m is for ways of kind 'straight' and 'route', not for {what}"
         if self.signals == "with" and self.kind in ("straight", "curve"):
             yield f"way signals 'with' is for ways over crossings; one of kind '{self.kind}' crosses no street"
         if self.fences and self.route:

@@ -25,33 +25,59 @@ from sumo_nets.maps.place_names import imported_place, place_called
 
 _MAKING: Final = "making the scenarios"
 _VERSION: Final = "own"
+_NOBODYS: Final = "scenario 'own': "
+"""What begins messages about a scenario that has no name yet."""
 _SLOWEST_MPS, _LEAST_S = 0.2, 60.0
 """A time limit that is not given is a minute and what the way takes at this speed."""
 
 
 class Made(NamedTuple):
-    """A scenario that could be made, or why not: as "way: ...", one message each."""
+    """A scenario, and what is against it, as "events[0]: ...", one message each: then it is without what does not fit,
+    and None where there is no way."""
 
     variant: Variant
     scenario: Scenario | None
     faults: tuple[str, ...]
 
 
+class _Street(NamedTuple):
+    """A scenario that has all but its crowd and its light, and what is against it, as `Made` has them."""
+
+    scenario: Scenario | None
+    faults: tuple[str, ...]
+
+
 def made_of(file: OwnFile, tell: Tell = untold) -> Iterator[Made]:
-    """Each scenario of a file, or what is against it. What the machine lacks is raised as MachineError."""
+    """Each scenario of a file, and what is against it. What the machine lacks is raised as MachineError."""
     for number, variant in enumerate(file.variants):
         tell(f"{_MAKING} of {file.path.name}", number / len(file.variants))
         yield made_one(variant, file.name)
 
 
 def made_one(variant: Variant, suite: str) -> Made:
-    """One scenario of a file, or what is against it; suite: the name of the file's scenarios."""
+    """One scenario of a file, and what is against it; suite: the name of the file's scenarios."""
+    own = variant.own
+    alike = {"name": "own", "goal_protocol": None, "crowd": OwnCrowd(), "light": Light(), "limits": OwnLimits()}
+    street, faults = _street(msgspec.structs.replace(own, **alike))
+    if street is None:
+        return Made(variant, None, faults)
+    limits = own.limits
+    time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
     try:
-        return Made(variant, _scenario(variant, suite), ())
-    except MachineError:
-        raise
-    except CosimError as error:
-        return Made(variant, None, tuple(str(error).split("\n")))
+        whole = msgspec.structs.replace(
+            street,
+            id=variant.id,
+            suite=suite,
+            crowd=own.crowd.spec,
+            light=own.light,
+            goal_radius_m=limits.goal_radius_m,
+            time_limit_s=time_s,
+            ends_on_failure=limits.ends_on_failure,
+            ends_at=limits.ends_at,
+        )
+    except SpecError as error:
+        return Made(variant, street, (*faults, str(error)))
+    return Made(variant, whole, faults)
 
 
 def suite_of_own(file: OwnFile, tell: Tell = untold) -> Suite:
@@ -77,31 +103,16 @@ def place_of_own(own: OwnPlace) -> Place:
     return place_called(own.file, own.roughness)
 
 
-def _scenario(variant: Variant, suite: str) -> Scenario:
-    own = variant.own
-    alike = {"name": "own", "goal_protocol": None, "crowd": OwnCrowd(), "light": Light(), "limits": OwnLimits()}
-    street = _street(msgspec.structs.replace(own, **alike))
-    limits = own.limits
-    time_s = limits.time_s or round(_LEAST_S + street.route_line.length_m / _SLOWEST_MPS, 1)
-    return msgspec.structs.replace(
-        street,
-        id=variant.id,
-        suite=suite,
-        crowd=own.crowd.spec,
-        light=own.light,
-        goal_radius_m=limits.goal_radius_m,
-        time_limit_s=time_s,
-        ends_on_failure=limits.ends_on_failure,
-        ends_at=limits.ends_at,
-    )
-
-
 @lru_cache(maxsize=1024)
-def _street(own: OwnScenario) -> Scenario:
-    """A scenario with all that stands and happens on its way; who walks there and the light come later."""
-    where, robot = _place(own.place), robot_called(own.robot)
-    _, street_map = place(where)
-    bare = laid_way(own.way, where, street_map, own.seed, robot)
+def _street(own: OwnScenario) -> _Street:
+    try:
+        where, robot = _place(own.place), robot_called(own.robot)
+        _, street_map = place(where)
+        bare = laid_way(own.way, where, street_map, own.seed, robot)
+    except MachineError:
+        raise
+    except CosimError as error:
+        return _Street(None, tuple(str(error).replace(_NOBODYS, "").split("\n")))
     faults: list[str] = []
     events, placed = [], []
     for number, event in enumerate(own.events):
@@ -114,14 +125,11 @@ def _street(own: OwnScenario) -> Scenario:
             placed.append(obstacle_along(thing, bare.route_line))
         except SpecError as error:
             faults.append(f"obstacles.placed[{number}]: {error}")
-    if faults:
-        raise SpecError("\n".join(faults))
-    whole = msgspec.structs.replace(
-        bare, events=tuple(events), obstacles=tuple(placed), crowd=NO_CROWD, light=Light(), ends_at="goal"
-    )
-    if not own.obstacles.per_100m:
-        return whole
-    return with_obstacles(whole, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside)
+    there = {"events": tuple(events), "obstacles": tuple(placed)}
+    whole = msgspec.structs.replace(bare, **there, crowd=NO_CROWD, light=Light(), ends_at="goal")
+    if own.obstacles.per_100m and not faults:
+        whole = with_obstacles(whole, street_map, per_100m=own.obstacles.per_100m, beside=own.obstacles.beside)
+    return _Street(whole, tuple(faults))
 
 
 _place = lru_cache(maxsize=64)(place_of_own)

@@ -86,6 +86,10 @@ def _drawn(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: R
         kind = cast(Structure, way.kind)
         short = build_unit(kind, where, street_map, graph, seed, "own", robot, **spans)
         return msgspec.structs.replace(short, obstacles=(), ends_on_failure=False)
+    if way.signals == "with" and not any(street_map.strips[name].signalised for name in graph.main_strips):
+        raise SpecError(
+            f"way signals 'with': map '{street_map.name}' has no crossing with signals that one can walk to"
+        )
     for again in range(_REDRAWN):
         drawn = (seed + again * _ANOTHER) % 2**32
         long = build_long_horizon(where, street_map, graph, drawn, "own", robot, length_m=way.length_m)
@@ -109,7 +113,15 @@ def _between(
 ) -> tuple[Polyline, tuple[RouteCrossing, ...], tuple[Barrier, ...]]:
     """The shortest way from start to goal over plain ground. Raises CosimError with what would help."""
     assert way.start is not None and way.goal is not None
-    start, goal = (_spot(street_map, name, xy) for name, xy in (("start", way.start), ("goal", way.goal)))
+    spots, faults = [], []
+    for name, xy in (("start", way.start), ("goal", way.goal)):
+        try:
+            spots.append(_spot(street_map, name, xy))
+        except SpecError as error:
+            faults.append(str(error))
+    if faults:
+        raise SpecError("\n".join(faults))
+    start, goal = spots
     if start.strip.id == goal.strip.id:
         route = _along_one(start, goal)
         ends = [Port(start.strip.id, 0)]

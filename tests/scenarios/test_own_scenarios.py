@@ -92,11 +92,16 @@ def test_everything_that_is_wrong_with_a_file_is_told_at_once(tmp_path: Path) ->
             "seeds = 1000\n" + SHORT + "[light]\nhour = [8, 9, 10, 11, 12, 13]\n",
             "makes 6000 scenarios, and at most 5000 can be had: give fewer values or seeds",
         ),
+        (f'name = "n"\n{CITY}[way]\nroute = [[1, 2], [1, 2]]\n', "way route needs two different points or more"),
+        (f'name = "n"\n{CITY}[way]\nstart = [nan, 2]\ngoal = [1, 2]', "way start[0] must be in [-10000000, 10000000]"),
+        (f'name = "n"\n{CITY}[way]\nlength_m = 20\n', "way: give one of kind, start and goal, route, not none"),
+        ('name = "n"\n[place]\nfile = "\\u0000"\n[way]\nkind = "curve"\n', "place file must be at most 1000 letters"),
         ("seeds = [1, 2]\n" + SHORT, "seeds: must be a whole number, not [1, 2]"),
     ],
     ids=[
         "syntax", "twice", "empty", "no-way", "no-goal", "three-numbers", "no-length", "too-long", "name-of-a-suite",
-        "both", "one-value", "no-value", "no-number", "too-many", "list-of-seeds",
+        "both", "one-value", "no-value", "no-number", "too-many", "one-point",
+        "nan", "length-of-none", "control-character", "list-of-seeds",
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused_with_its_remedy(tmp_path: Path, text: str, told: str) -> None:
@@ -221,7 +226,7 @@ def test_what_is_written_anew_is_sound_and_can_be_drawn(tmp_path: Path, cosim: C
     again, done = (cosim("scenario", *words, cwd=tmp_path) for words in (("new", "mine.toml"), ("check", "mine.toml")))
     assert again.returncode == 2 and "is there already" in again.stderr
     assert done.returncode == 0 and "mine.toml: 1 scenario" in done.stdout and " 40.0 " in done.stdout, done.stderr
-    for words in (("-o", "way.png"), ("--whole", "-o", "town.png")):
+    for words in (("-o", "way.png"), ("--whole", "-o", "town.png"), ("--zoom", "0,0,90,60", "-o", "part.png")):
         done = cosim("scenario", "draw", "mine.toml", *words, cwd=tmp_path)
         assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(b"\x89PNG"), done.stderr
 
@@ -251,3 +256,5 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
         "blocked.toml: event 'e0': people of 'queueing' must be 2 to 5, not 9",
     ):
         assert told in done.stderr, done.stderr
+    drawn = cosim("scenario", "draw", "odd.toml", "-o", "odd.png", cwd=tmp_path)
+    assert drawn.returncode == 2 and (tmp_path / "odd.png").exists() and "events[0]: at_m 2 does not" in drawn.stderr
