@@ -44,7 +44,7 @@ class PairedDifference(NamedTuple):
 
     def verdict(self, higher_is_better: bool | None) -> PairedVerdict:
         """In words, of a metric of which more is better, worse, or neither (None)."""
-        if not (self.low > 0.0 or self.high < 0.0):
+        if not self.changed or self.low <= 0.0 <= self.high:
             return "within noise"
         if self.changed < FEWEST_CHANGED:
             return "too few"

@@ -47,13 +47,14 @@ def test_pairs_are_drawn_as_pairs() -> None:
 
 
 def test_what_is_alike_is_within_noise() -> None:
-    """No change: an interval of nothing, around 0. Of one scenario no interval exists, of none nothing does."""
+    """No change: an interval of nothing, around 0. Of one that changed no interval exists, and it is too few; of none
+    nothing does."""
     values = np.array([0.3, NAN, 0.7, 1.0])
     alike = difference_of_means(values, values)
     assert (alike.low, alike.high, alike.n, alike.changed, alike.verdict(True)) == (0.0, 0.0, 3, 0, "within noise")
     rates = difference_of_rates((values, values), (values, values))
     assert (rates.low, rates.high, rates.changed, rates.verdict(False)) == (0.0, 0.0, 0, "within noise")
-    assert flips(1, 1, 0).verdict(True) == "within noise" and np.isnan(flips(1, 1, 0).low)
+    assert flips(1, 1, 0).verdict(True) == "too few" and np.isnan(flips(1, 1, 0).low)
     none = difference_of_means(np.array([NAN, 1.0]), np.array([1.0, NAN]))
     assert none.n == 0 and np.isnan(none.difference) and none.verdict(True) == "within noise"
 
