@@ -13,13 +13,13 @@ from typing import Annotated, get_args
 import typer
 from rich.markup import escape
 
+from cosim.cli import eyes
 from cosim.cli.bench import bench
 from cosim.cli.board import Board
 from cosim.cli.city import city_app
 from cosim.cli.compare import compare
 from cosim.cli.consoles import err, out
 from cosim.cli.crowd import CHILDREN_HELP, CROWD_HELP, ELDERLY_HELP, GROUPS_HELP, VEHICLES_SHARE, compare_one
-from cosim.cli.eyes import CAMERA_HELP, RESIDENTS_HELP, ROBOT_HELP, Choice, camera_here, export, film, look
 from cosim.cli.latency import LATENCY_HELP, REAL_TIME_HELP, with_latency
 from cosim.cli.live import LONGEST_WAIT_S, checked_endpoint, direct, inject, listen, replay
 from cosim.cli.map import map_app
@@ -85,12 +85,13 @@ def common(
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
     "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
-    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`",
+    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n"
+    "`cosim run reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
 )
 def run_command(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
-    robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
+    robot: Annotated[str, typer.Option(help=eyes.ROBOT_HELP)] = "",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
@@ -107,7 +108,7 @@ def run_command(
         float | None, typer.Option(help="Of the ground of --map: from 0, flat, to 1 (raised slabs, roots, potholes).")
     ] = None,
     crowd: Annotated[int | None, typer.Option(min=0, help=CROWD_HELP)] = None,
-    residents: Annotated[int | None, typer.Option(min=0, help=RESIDENTS_HELP)] = None,
+    residents: Annotated[int | None, typer.Option(min=0, help=eyes.RESIDENTS_HELP)] = None,
     groups: Annotated[float | None, typer.Option(help=GROUPS_HELP)] = None,
     elderly: Annotated[float | None, typer.Option(help=ELDERLY_HELP)] = None,
     children: Annotated[float | None, typer.Option(help=CHILDREN_HELP)] = None,
@@ -115,7 +116,7 @@ def run_command(
     latency: Annotated[str, typer.Option(metavar="MS", help=LATENCY_HELP)] = "",
     real_time: Annotated[bool, typer.Option("--real-time", help=REAL_TIME_HELP)] = False,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
-    camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    camera: Annotated[eyes.Choice, typer.Option(metavar="CAMERA", help=eyes.CAMERA_HELP)] = "auto",
     own_camera: Annotated[bool, typer.Option("--own-camera", help=OWN_CAMERA_HELP)] = False,
     live: Annotated[
         str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
@@ -132,6 +133,7 @@ def run_command(
     start_timeout: Annotated[
         float, typer.Option(min=0.1, help="The same for loading it, for its reset, and for the first answer after it.")
     ] = 300.0,
+    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=eyes.RERUN_HELP)] = None,
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
@@ -178,8 +180,9 @@ def run_command(
     picked = scenarios_chosen(whole, scenario or (), episodes, event or (), split)
     loaded = load_policy(policy)
     manifest = loaded.manifest
-    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
+    drawn_by = eyes.camera_here(camera) if manifest.camera is not None else "bullet"
     asks = shared_renderer and check_shared(loaded, drawn_by)
+    eyes.check_rerun(rerun, len(picked))
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
     run_seed = seed_of_run(seed, folder if resume else None)
@@ -259,6 +262,7 @@ def run_command(
         err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
     if lacking or table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
+    eyes.write_rerun(path, [scenario.id for scenario in picked], rerun)
 
 
 @app.command("list", epilog="Examples:  \n`cosim list`  \n`cosim list reactive`")
@@ -277,7 +281,8 @@ def list_all(
 
 @app.command(
     epilog="Examples:  \n`cosim show runs/mine`  \n`cosim show runs/mine --events`  \n"
-    "`cosim show runs/mine --episode lh-011-00 -o episode.png`"
+    "`cosim show runs/mine --episode lh-011-00 -o episode.png`  \n"
+    "`cosim show runs/mine --episode lh-011-00 --rerun episode.rrd`"
 )
 def show(
     folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
@@ -288,6 +293,7 @@ def show(
     events: Annotated[
         bool, typer.Option("--events", help="What was measured of every event, from its tracks.")
     ] = False,
+    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=eyes.RERUN_HELP)] = None,
 ) -> None:
     """Show the table of a run, finished or not, or one episode as a picture from above."""
     from cosim.cli.tables import kinds_of, print_by_kind, print_episode, print_sheet, print_table
@@ -296,6 +302,9 @@ def show(
 
     spec = read_spec(folder)
     records = {record.scenario: record for record in read_records(folder)}
+    if rerun is not None:
+        eyes.write_rerun(folder, [] if episode is None else [episode], rerun)
+        return
     if events:
         if episode is not None:
             raise UsageError("--events is about a whole run: leave --episode out")
@@ -328,9 +337,9 @@ app.command(epilog="Examples:  \n`cosim verify`  \n`cosim verify --case lh-001-0
 app.command(
     rich_help_panel=LOOK,
     epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`",
-)(look)
+)(eyes.look)
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim film runs/mine lh-011-00 --from 30 --to 60 -o film.mp4`")(
-    film
+    eyes.film
 )
 app.command(
     rich_help_panel=LOOK,
@@ -338,7 +347,7 @@ app.command(
     "`cosim report runs/unit-mine runs/reactive-mine runs/reactive-theirs --failures 24`",
 )(report)
 app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim replay runs/mine lh-011-00`")(replay)
-app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")(export)
+app.command(rich_help_panel=LOOK, epilog="Example:  \n`cosim export lh-011-00 street.glb`")(eyes.export)
 app.command("counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`")(
     compare_one
 )
