@@ -52,7 +52,8 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
         assert f"{room}/py.typed" in names
         for path in (ROOT / room).rglob("*.py"):
             assert path.relative_to(ROOT).as_posix() in names
-    assert {"scenarios/suites/long-horizon.json", "physics/robots/courier.urdf"} <= names
+    needed = {"scenarios/suites/long-horizon.json", "physics/robots/courier.urdf", "scenarios/own/template.toml"}
+    assert needed <= names
     assert not [n for n in names if n.split("/")[0] not in ROOMS and ".dist-info" not in n]
 
 

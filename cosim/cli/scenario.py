@@ -151,9 +151,9 @@ def run_own(
     All other options of runs go with `cosim run FILE.toml`.
     """
     from cosim.policies.load import load_policy
-    from cosim.records.run_folder import read_records
+    from cosim.records.run_folder import read_records, read_spec
     from cosim.spec.options import EpisodeOptions
-    from scenarios.execution.suite_run import run
+    from scenarios.execution.suite_run import run, seed_of_run
     from scenarios.own.checking import checked_own
     from scenarios.own.reading import read_own
 
@@ -168,23 +168,26 @@ def run_own(
     by_goal: dict[GoalProtocol | None, list[str]] = {}
     for variant in own.variants:
         by_goal.setdefault(variant.own.goal_protocol, []).append(variant.id)
+    # A run tells its policies of the goal in one way: a sweep over these is as many runs, of one seed.
+    parts = {goal: path if len(by_goal) == 1 else path / str(goal) for goal in by_goal}
+    begun = [part for part in parts.values() if resume and (part / "run.json").exists()]
+    if resume and not begun:
+        read_spec(path)
+    run_seed = seed_of_run(seed, begun[0] if begun else None)
+    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     _say(own)
     tables = []
     for goal, ids in by_goal.items():
-        # A run tells its policies of the goal in one way: a sweep over these is as many runs.
-        part = path if len(by_goal) == 1 else path / str(goal)
-        begun = resume and (part / "run.json").exists()
-        done = {record.scenario for record in read_records(part)} if begun else set()
+        part = parts[goal]
+        done = {record.scenario for record in read_records(part)} if part in begun else set()
         board = Board([one for one in suite.scenarios if one.id in ids], done)
-        options = EpisodeOptions(
-            seed=seed, goal=goal, frames_every_s=frames, camera=camera_here(camera) if manifest.camera else "bullet"
-        )
+        options = EpisodeOptions(seed=run_seed, goal=goal, frames_every_s=frames, camera=drawn_by)
         try:
             with board.bars:
-                again = begun or (resume and len(by_goal) == 1)
                 table = run(
-                    suite, policy, scenarios=ids, jobs=jobs, out=part, resume=again, options=options, tell=board.tell
-                )
+                    suite, policy, scenarios=ids, jobs=jobs, out=part, resume=part in begun, options=options,
+                    tell=board.tell,
+                )  # fmt: skip
         except KeyboardInterrupt:
             err.print(f"Stopped. What is finished is kept in {part}: go on with --out {path} --resume", soft_wrap=True)
             raise typer.Exit(INTERRUPTED) from None

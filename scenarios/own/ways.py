@@ -29,7 +29,7 @@ _NEAREST_M: Final = 8.0
 _END_M: Final = 0.5
 """A start or goal keeps this far from the ends of its sidewalk."""
 _EXACT_M: Final = 0.05
-_REDRAWN: Final = 6
+_REDRAWN: Final = 20
 """So many ways are drawn until one has signals, or has none, as is asked for."""
 _ANOTHER: Final = 1_000_003
 """From the seed of one draw to the next one's."""
@@ -95,7 +95,9 @@ def _drawn(way: OwnWay, where: Place, street_map: StreetMap, seed: int, robot: R
         long = build_long_horizon(where, street_map, graph, drawn, "own", robot, length_m=way.length_m)
         if _as_asked(way, long.crossings):
             return msgspec.structs.replace(long, obstacles=(), events=(), seed=seed)
-    raise SpecError(f"way signals '{way.signals}': {_REDRAWN} ways that were drawn are not so: give another seed")
+    raise SpecError(
+        f"way signals '{way.signals}': {_REDRAWN} ways that were drawn are not so: give another seed, or start and goal"
+    )
 
 
 def _as_asked(way: OwnWay, crossings: tuple[RouteCrossing, ...]) -> bool:
