@@ -207,7 +207,8 @@ def run_command(
         director=outside,
         counterfactual=counterfactual,
     )
-    options = with_latency(options, latency, real_time, folder if resume else None, whole, picked[0], policy)
+    went_on = folder if resume else None
+    options = with_latency(options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz)
     check_alone(options, jobs, shared_renderer)
     spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:

@@ -32,9 +32,10 @@ def with_latency(
     whole: Suite,
     first: Scenario,
     policy: str,
+    rate_hz: float,
 ) -> EpisodeOptions:
     """Options with the latency that was asked for; measured by driving `first`, or that of the run that is resumed.
-    Raises UsageError."""
+    policy, rate_hz: its name, and how often it acts. Raises UsageError."""
     from cosim.records.run_folder import read_spec
     from scenarios.execution.suite_run import measured_latency_ms
 
@@ -47,6 +48,13 @@ def with_latency(
     with doing(f"measuring the latency of {policy} in {first.id}"):
         latency_ms = measured_latency_ms(whole, first, policy, options)
     err.print(f"Latency {latency_ms:g} ms, measured in {first.id}: that of every command of this run.", highlight=False)
+    if latency_ms > (period_ms := 1000.0 / rate_hz):
+        err.print(
+            f"That is longer than its period of {period_ms:g} ms, at which it is asked all the same. With --real-time "
+            "it is not asked again before it has answered.",
+            soft_wrap=True,
+            highlight=False,
+        )
     return msgspec.structs.replace(options, latency_ms=latency_ms)
 
 

@@ -103,7 +103,7 @@ def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, to
     """By name, with the remedy."""
     whole = load_suite("reactive")
     with pytest.raises(UsageError, match=re.escape(told)):
-        with_latency(EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop")
+        with_latency(EpisodeOptions(), asked, real_time, None, whole, whole.scenarios[0], "stop", 4.0)
 
 
 def small_in_two_s() -> Scenario:
@@ -123,7 +123,7 @@ class Slow:
     def reset(self, episode_id, seed): ...
 
     def act(self, observation):
-        time.sleep(0.12)
+        time.sleep(0.26)
         return Command(0.5, 0.0)
 """
 
@@ -190,8 +190,9 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     assert said.returncode == 0, said.stderr
     latency_ms = read_spec(tmp_path / "mine").latency_ms
     (record,) = read_records(tmp_path / "mine")
-    assert latency_ms == record.latency_ms >= 150.0 and not record.real_time
+    assert latency_ms == record.latency_ms >= 300.0 and not record.real_time
     assert f"latency {latency_ms:g} ms: commands take effect" in said.stdout
+    assert "longer than its period of 250 ms" in said.stderr
     log = Log.load(tmp_path / "mine" / "episodes" / short.id / "trajectory.npz")
     assert (log.answers[:, 1] * 50.0 == latency_ms).all()
     assert cosim(*words, "--latency", "measured", "--resume", cwd=tmp_path).returncode == 0
