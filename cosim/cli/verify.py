@@ -18,7 +18,7 @@ def doctor() -> None:
     """Check that every engine works here: versions, a frame, a query, a step."""
     try:
         from scenarios.checks import CHECKS
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         raise EngineError(_LACKING.format(error)) from error
 
     failed = 0
@@ -48,7 +48,7 @@ def verify(
         from scenarios.verifying.cases import verified_cases
         from scenarios.verifying.shipped import SHIPPED, Given, given_here, writable
         from scenarios.verifying.verdict import blamed, findings
-    except ImportError as error:
+    except (ImportError, OSError) as error:
         raise EngineError(_LACKING.format(error)) from error
 
     cases = {one.id: one for one in verified_cases()}

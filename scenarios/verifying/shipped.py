@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import msgspec
 
-from cosim.core.errors import CosimError, EngineError, RunError, unwritable
+from cosim.core.errors import EngineError, RunError, unwritable
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
 from cosim.spec.scenario import Scenario
 from physics.cameras.choice import camera_of_choice, renderer_of
 from scenarios.catalog import SUITES, load_suite
+from scenarios.execution.run import in_words
 from scenarios.verifying.engines import DRIVER, engines_alone, room_hashes, textures
 from scenarios.verifying.traces import Trace, traced
 
@@ -57,45 +59,49 @@ class Given(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def given_here(cases: Sequence[Scenario], jobs: int, tell: Callable[[str], None]) -> Given:
-    """What this installation gives: `jobs` processes, or this one. tell: is told the name of what is under way."""
-    tell("the engines alone")
-    alone = engines_alone()
-    tell("textures")
-    pictures = textures()
-    traces: dict[str, Trace | str] = {}
-    if jobs == 1:
-        for case in cases:
-            tell(case.id)
-            traces[case.id] = trace_of(case)
-    else:
-        context = multiprocessing.get_context("spawn")
-        with ProcessPoolExecutor(jobs, context) as pool:
-            under_way = {case.id: pool.submit(trace_of, case) for case in cases}
-            for name, one in under_way.items():
-                tell(name)
-                try:
-                    traces[name] = one.result()
-                except BrokenProcessPool:
-                    raise EngineError(
-                        f"a process died in {name} or beside it: try --jobs 1, and `cosim doctor`"
-                    ) from None
+    """What this installation gives: `jobs` processes, or this one. tell: is told the name of what is under way. Raises
+    EngineError when a process dies."""
+    work: dict[str, Callable[[], Any]] = {"the engines alone": engines_alone, "textures": textures}
+    work |= {case.id: partial(trace_of, case) for case in cases}
+    alone, layers, *traces = _done_here(work, tell) if jobs == 1 else _done_in_processes(work, jobs, tell)
     return Given(
         versions=versions(),
         renderer=renderer_of(camera_of_choice("gl")) if DRIVER in alone else "",
         suites={name: load_suite(name).content_hash for name in SUITES},
         sources=room_hashes(),
         alone=alone,
-        textures=pictures,
-        traces=traces,
+        textures=layers,
+        traces={case.id: trace for case, trace in zip(cases, traces, strict=True)},
     )
+
+
+def _done_here(work: Mapping[str, Callable[[], Any]], tell: Callable[[str], None]) -> list[Any]:
+    done = []
+    for name, do in work.items():
+        tell(name)
+        done.append(do())
+    return done
+
+
+def _done_in_processes(work: Mapping[str, Callable[[], Any]], jobs: int, tell: Callable[[str], None]) -> list[Any]:
+    done = []
+    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn")) as pool:
+        for name, one in {name: pool.submit(do) for name, do in work.items()}.items():
+            tell(name)
+            try:
+                done.append(one.result())
+            except BrokenProcessPool:
+                where = f"a process died in {name}, or in what was under way beside it"
+                raise EngineError(f"{where}: `cosim verify --jobs 1` shows where, `cosim doctor` what works") from None
+    return done
 
 
 def trace_of(case: Scenario) -> Trace | str:
     """The trace of a case; what went wrong, in words, where there is none."""
     try:
         return traced(case)
-    except CosimError as error:
-        return str(error)
+    except Exception as error:  # noqa: BLE001  what a wrong version of a package does is told with all the rest
+        return in_words(error)
 
 
 def writable(given: Given, cases: Sequence[str]) -> Given:

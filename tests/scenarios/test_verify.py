@@ -15,9 +15,10 @@ from cosim.core.errors import RunError
 from cosim.core.state import Frame
 from scenarios.catalog import SUITES, load_suite
 from scenarios.verifying import engines
+from scenarios.verifying import shipped as shipped_values
 from scenarios.verifying.cases import verified_cases
 from scenarios.verifying.engines import DRIVER, ROOMS, room_hashes, textures
-from scenarios.verifying.shipped import SHIPPED, Given, writable
+from scenarios.verifying.shipped import SHIPPED, Given, trace_of, writable
 from scenarios.verifying.traces import Trace, kept_picture, traced
 from scenarios.verifying.verdict import blamed, findings, first_difference
 from sumo_nets.crowd import pose_filter
@@ -211,6 +212,16 @@ def test_damaged_values_are_named(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "verify.json").write_bytes(content)
     with pytest.raises(RunError, match=r"verify\.json: holds nothing to verify by: .*\. Install anew$"):
         Given.load(tmp_path / "verify.json")
+
+
+def test_whatever_a_case_raises_is_told_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also what no error of this project is, as another version of a package brings it."""
+
+    def traced(case: object) -> Trace:
+        raise AttributeError("module 'numpy' has no attribute 'frob'")
+
+    monkeypatch.setattr(shipped_values, "traced", traced)
+    assert trace_of(verified_cases()[0]) == "AttributeError: module 'numpy' has no attribute 'frob'"
 
 
 def test_a_case_that_there_is_not_is_refused(cosim: Cosim) -> None:
