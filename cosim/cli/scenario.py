@@ -63,15 +63,22 @@ def write_template(
 
 
 @scenario_app.command(
-    "check", epilog="Examples:  \n`cosim scenario check mine.toml`  \n`cosim scenario check scenarios/examples/*.toml`"
+    "check",
+    epilog="Examples:  \n`cosim scenario check mine.toml --drive`  \n`cosim scenario check scenarios/examples/*.toml`",
 )
-def check_own(files: Annotated[list[Path], typer.Argument(metavar="FILE...", help=_FILE_HELP)]) -> None:
-    """Say what scenarios are, or everything that is wrong with them: fields, place, way, events, obstacles, room."""
+def check_own(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help=_FILE_HELP)],
+    drive: Annotated[bool, typer.Option("--drive", help="Have the oracle drive each: can it be solved?")] = False,
+) -> None:
+    """Say what scenarios are, or everything that is wrong with them: fields, place, way, events, obstacles, room.
+
+    Exit code 1: the oracle failed in one.
+    """
     from scenarios.own.checking import own_faults
     from scenarios.own.making import suite_of_own
     from scenarios.own.reading import read_own
 
-    faulty = 0
+    faulty = failed = 0
     for path in files:
         try:
             with doing(f"checking {path}") as tell:
@@ -85,9 +92,31 @@ def check_own(files: Annotated[list[Path], typer.Argument(metavar="FILE...", hel
                 err.print(f"{path}: {fault}", soft_wrap=True, markup=False, highlight=False)
         else:
             _say(own)
-            _print_scenarios(suite_of_own(own), own)
+            suite = suite_of_own(own)
+            _print_scenarios(suite, own)
+            failed += _driven(suite) if drive else 0
     if faulty:
         raise typer.Exit(WRONG_USE)
+    if failed:
+        raise typer.Exit(SOME_CRASHED)
+
+
+def _driven(suite: Suite) -> int:
+    """Say of each scenario whether the oracle comes through without a failure. Returns in how many it does not."""
+    from scenarios.builders.proofs import Dropped
+    from scenarios.builders.proving import EXPERT, proved
+
+    failed = 0
+    for one in suite.scenarios:
+        with doing(f"{EXPERT} drives {one.id}"):
+            proof = proved(one)
+        if isinstance(proof, Dropped):
+            failed += 1
+            words = f"{EXPERT} fails: {proof.reason} {proof.details}"
+        else:
+            words = f"solved by {EXPERT} in {proof.time_s:.1f} s"
+        out.print(f"{one.id}: {words}", soft_wrap=True, markup=False, highlight=False)
+    return failed
 
 
 @scenario_app.command(
@@ -271,6 +300,10 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
             out.print(f"way: {name} was moved by {far_m:.1f} m to the middle of its sidewalk")
     for note in dict.fromkeys(note for one in suite.scenarios for note in narrow_events(one)):
         out.print(f"note: {note}", soft_wrap=True, markup=False, highlight=False)
+    for variant, one in zip(own.variants, suite.scenarios, strict=True):
+        asked = variant.own.obstacles
+        if asked.per_100m and len(one.obstacles) == len(asked.placed):
+            out.print(f"note: {one.id}: no room for obstacles that leave the robot's width and 0.5 m", soft_wrap=True)
     where = ", ".join(sorted({one.place.name for one in suite.scenarios}))
     least_s, most_s = (end(one.time_limit_s for one in suite.scenarios) for end in (min, max))
     limits = f"{least_s:g}" if least_s == most_s else f"{least_s:g} to {most_s:g}"

@@ -11,6 +11,7 @@ from cosim.core.errors import CosimError, SpecError
 from cosim.core.telling import Tell, untold
 from cosim.spec.scenario import Light, Scenario, Suite, event_faults
 from cosim.spec.spec_file import in_lines
+from physics.cameras.hdri import read_hdri
 from scenarios.builders.fits import misfits
 from scenarios.builders.long_horizon import WAY_SPARE_M
 from scenarios.builders.obstacles import TO_SPARE_M, prove_gap
@@ -43,6 +44,11 @@ def checked_own(file: OwnFile, tell: Tell = untold) -> Suite:
 def _faults_on_the_street(scenario: Scenario) -> Iterator[str]:
     _, street_map = place(scenario.place)
     yield from event_faults(scenario, EVENT_KINDS)
+    try:
+        if scenario.light.hdri:
+            read_hdri(scenario.light.hdri)
+    except SpecError as error:
+        yield f"light.hdri: {error}"
     told = list(misfits([scenario], street_map))
     yield from told
     if not told:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 
 import msgspec
 
-from cosim.core.errors import CosimError, MachineError, SpecError
+from cosim.core.errors import CosimError, MachineError, MapError, SpecError
 from cosim.core.telling import Tell, untold
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import City, CityMap, Light, Place, Scenario, Suite
@@ -98,9 +98,15 @@ def place_of_own(own: OwnPlace) -> Place:
     path = Path(own.file)
     if not path.exists():
         raise SpecError(f"place.file: there is no {path}: give its path from the folder of this file")
-    if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
-        return CityMap(map=imported_place(path), roughness=own.roughness)
-    return place_called(own.file, own.roughness)
+    try:
+        if path.is_file() and not path.name.endswith((".net.xml", ".net.xml.gz")):
+            return CityMap(map=imported_place(path), roughness=own.roughness)
+        return place_called(own.file, own.roughness)
+    except MapError as error:
+        remedy = (
+            ": `cosim map import` takes that, and gives the name for place.map" if "--upgrade" in str(error) else ""
+        )
+        raise MapError(f"place.file: {error}{remedy}") from error
 
 
 @lru_cache(maxsize=1024)

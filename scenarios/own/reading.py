@@ -228,13 +228,19 @@ def _variants(tree: dict[str, Any], axes: Sequence[Axis], folder: Path) -> Itera
         for field, value in at.items():
             one = _with(one, field, value)
         own = msgspec.convert(one, OwnScenario)
-        if own.place.file:
-            whole = msgspec.structs.replace(own.place, file=str((folder / own.place.file).resolve()))
-            own = msgspec.structs.replace(own, place=whole)
+        own = _beside(own, folder)
         for repetition in range(seeds):
             seed = (own.seed + repetition) % 2**32
             repeated = msgspec.structs.replace(own, seed=seed, seeds=1)
             yield Variant(_id_of(own.name, axes, picked, seed if seeds > 1 else None), repeated, at)
+
+
+def _beside(own: OwnScenario, folder: Path) -> OwnScenario:
+    """The same with paths from the folder of its file made whole."""
+    replace, place, light = msgspec.structs.replace, own.place, own.light
+    if place.file:
+        own = replace(own, place=replace(place, file=str((folder / place.file).resolve())))
+    return replace(own, light=replace(light, hdri=str((folder / light.hdri).resolve()))) if light.hdri else own
 
 
 def _id_of(name: str, axes: Sequence[Axis], picked: Sequence[int], seed: int | None) -> str:

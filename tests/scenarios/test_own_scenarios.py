@@ -219,8 +219,8 @@ def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
 
 
 @pytest.mark.engine
-def test_what_is_written_anew_is_sound_and_can_be_drawn(tmp_path: Path, cosim: Cosim) -> None:
-    """`new`, `check`, `draw`: from nothing to a picture; a name that is taken, or no place to write to, is refused."""
+def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cosim: Cosim) -> None:
+    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table; a name that is taken is refused."""
     done = cosim("scenario", "new", "mine.toml", cwd=tmp_path)
     assert done.returncode == 0 and (tmp_path / "mine.toml").read_text().count('name = "mine"') == 1
     again, done = (cosim("scenario", *words, cwd=tmp_path) for words in (("new", "mine.toml"), ("check", "mine.toml")))
@@ -229,6 +229,10 @@ def test_what_is_written_anew_is_sound_and_can_be_drawn(tmp_path: Path, cosim: C
     for words in (("-o", "way.png"), ("--whole", "-o", "town.png"), ("--zoom", "0,0,90,60", "-o", "part.png")):
         done = cosim("scenario", "draw", "mine.toml", *words, cwd=tmp_path)
         assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(b"\x89PNG"), done.stderr
+    text = (tmp_path / "mine.toml").read_text()
+    (tmp_path / "mine.toml").write_text(text.replace("# time_s = 260", "time_s = 1"))
+    done = cosim("scenario", "run", "mine.toml", "--policy", "straight", "--out", "run", cwd=tmp_path)
+    assert done.returncode == 0 and "Run folder: run" in done.stdout, done.stderr
 
 
 @pytest.mark.engine
@@ -241,6 +245,7 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
     )
     (tmp_path / "blocked.toml").write_text(
         SHORT + '[[obstacles.placed]]\nkind = "bin"\nat_m = 0.3\n[[events]]\nkind = "queueing"\npeople = 9\n'
+        '[light]\nhdri = "none.hdr"\n'
     )  # fmt: skip
     fences = (f'[[obstacles.placed]]\nkind = "fence"\nat_m = 15\nturned_deg = 90\nleft_m = {m}\n' for m in (-0.9, 0.9))
     (tmp_path / "narrow.toml").write_text(SHORT + "".join(fences))
@@ -252,9 +257,21 @@ def test_what_does_not_fit_its_place_is_told_for_all_files(tmp_path: Path, cosim
         "odd.toml: events[1]: 'ped_crossing' needs a crossing without signals",
         "odd.toml: obstacles.placed[0]: at_m 99 is past the goal: the way is 30.0 m long",
         "blocked.toml: obstacles[0] (bin) stands where the robot starts",
+        "none.hdr' does not exist",
         "narrow.toml: its obstacles leave no gap of ",
         "blocked.toml: event 'e0': people of 'queueing' must be 2 to 5, not 9",
     ):
         assert told in done.stderr, done.stderr
     drawn = cosim("scenario", "draw", "odd.toml", "-o", "odd.png", cwd=tmp_path)
     assert drawn.returncode == 2 and (tmp_path / "odd.png").exists() and "events[0]: at_m 2 does not" in drawn.stderr
+
+
+@pytest.mark.engine
+def test_whether_a_scenario_can_be_solved_is_driven_by_the_oracle(tmp_path: Path, cosim: Cosim) -> None:
+    """`check --drive` says in what time, or where the oracle fails; then the exit code is 1."""
+    near = SHORT.replace("length_m = 30", "length_m = 10")
+    (tmp_path / "near.toml").write_text(near)
+    (tmp_path / "hasty.toml").write_text(near + "[limits]\ntime_s = 2\n")
+    solved, hasty = (cosim("scenario", "check", name, "--drive", cwd=tmp_path) for name in ("near.toml", "hasty.toml"))
+    assert solved.returncode == 0 and "short: solved by orca in " in solved.stdout, solved.stderr
+    assert hasty.returncode == 1 and "short: orca fails: ended by time" in hasty.stdout, hasty.stderr
