@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,14 @@ def test_the_template_shows_every_field_there_is() -> None:
         return found
 
     assert fields(OwnScenario) - shown == {"shadows", "hdri", "paint"}
+
+
+def test_the_file_in_the_readme_can_be_read(tmp_path: Path) -> None:
+    """What it shows is a sweep over density, on a map's file beside it."""
+    (shown,) = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    own = read_own(written(tmp_path, shown))
+    assert [axis.field for axis in own.axes] == ["crowd.density"]
+    assert Path(own.variants[0].own.place.file).parent == tmp_path
 
 
 def on_tiny(**way: Any) -> Scenario:
