@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Final, NamedTuple, TypeVar
 
+import msgspec
 import numpy as np
 import shapely
 
@@ -32,6 +33,8 @@ from scenarios.viewing.scenes import ShownAgain, image_url, show_again
 
 _MOST_BYTES: Final = 29_000_000
 """Of the file; failures beyond it are left out of the gallery, the least telling first."""
+_REST_BYTES: Final = 8_000_000
+"""Of these for all but failures and maps: Plotly, tables, small pictures, every place of failure."""
 _MOST_MAPS: Final = 24
 _MAP_PX: Final = 1000
 _MAP_QUALITY: Final = 70
@@ -72,15 +75,11 @@ def make_report(
             raise
     entries = [_entry(runs[pick.run], pick, showings[k]) for k, pick in enumerate(picks)]
     tell("writing the page")
-
-    def made(count: int) -> bytes:
-        maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
-        return page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
-
-    count, data = len(entries), made(len(entries))
-    while len(data) > _MOST_BYTES and count:
-        count -= max(1, round(count * (1.0 - _MOST_BYTES / len(data))))
-        data = made(count)
+    fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
+    sizes = np.array([len(msgspec.json.encode(entry)) for entry in entries], dtype=int)
+    count = int((fixed + np.cumsum(sizes) <= _MOST_BYTES).sum())
+    maps = Maps(pictures, _spots(runs, picks[:count]), dict(counts_of(runs)))
+    data = page_of(runs, plots, entries[:count], maps, _note(entries[:count]))
     try:
         write_whole(output, data)
     except OSError as error:

@@ -14,7 +14,6 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.core.state import Age, PersonKind
 from cosim.records.results import summary_of
 from cosim.records.run_folder import RunFolder, read_spec
 from cosim.report.page.choice import most_telling, shown_of
@@ -102,6 +101,22 @@ def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_p
     assert len(most_telling(candidates, 48)) == 24 and len({one.scenario for one in most_telling(candidates, 48)}) == 24
 
 
+def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(tmp_path: Path) -> None:
+    """A failure after 100 s yields to one after 4 s of the same facets, and many of them to the time that there is."""
+    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
+    (soon,) = shown_of(runs)
+    late = [
+        soon._replace(
+            scenario=f"l-{k}",
+            mishap=soon.mishap._replace(tick=2000 + k),
+            facets=soon.facets | {k} if k else soon.facets,
+        )
+        for k in range(12)
+    ]
+    assert most_telling([late[0], soon], 1) == [soon]
+    assert len(most_telling([*late, soon])) == 6
+
+
 def test_a_failure_counts_where_so_many_people_were_near() -> None:
     """Two people within 10 m in the second of the failure: it and that second's metres are in their bin."""
     way = short_way("s-000", ends_on_failure=False)
@@ -109,15 +124,13 @@ def test_a_failure_counts_where_so_many_people_were_near() -> None:
     assert log is not None
     seen = np.array([0, 20, 40, 60, 60])
     xy = np.column_stack([log.pose[seen, 0] + [50.0, 50.0, 50.0, 3.0, -3.0], np.zeros(5)])
-    kinds = {"people_kind": np.full(5, PersonKind.CROWD), "people_age": np.full(5, Age.ADULT)}
-    log = type(log)(**{**vars(log), "people_tick": seen, "people_xy": xy, **kinds})
-    near = near_of(log)
+    near = near_of(log.pose, seen, xy)
     assert near[59] == 0.0 and near[60] == near[79] == 2.0
     record = msgspec.structs.replace(record, failures=(failure_at(log, 70), failure_at(log, 75, "freezing")))
-    exposure = exposure_of(record, log, near, (1.0, 3.0), moving=False)
+    exposure = exposure_of(record, log.travelled_m, near, (1.0, 3.0), moving=False)
     assert exposure.failures.tolist() == [0.0, 2.0, 0.0]
     assert exposure.metres.sum() == pytest.approx(log.travelled_m.sum()) and exposure.metres[1] == pytest.approx(1.0)
-    assert exposure_of(record, log, near, (1.0, 3.0), moving=True).failures.tolist() == [0.0, 1.0, 0.0]
+    assert exposure_of(record, log.travelled_m, near, (1.0, 3.0), moving=True).failures.tolist() == [0.0, 1.0, 0.0]
 
 
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:

@@ -109,12 +109,14 @@ def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
 
 
 def test_plots_and_maps_are_drawn(page: Page) -> None:
-    """Every plot has marks in it, the map of the chosen place its failures, and a click on one opens it."""
+    """Every plot has marks in it, the map of the chosen place its failures; there is a choice for each place."""
     plots = page.js("document.querySelectorAll('[data-plot]').length")
     marks = "[...document.querySelectorAll('[data-plot]')].filter((p) => p.querySelector('.point, .bars path')).length"
     assert plots and page.js(marks) == plots
     page.until("document.querySelectorAll('#map .points path').length > 0")
     assert page.js("document.querySelectorAll('#map image').length") == 1
+    buttons = page.js("[...document.querySelectorAll('.modebar-btn')].map((button) => button.dataset.title)")
+    assert buttons == ["Pan", "Zoom", "Zoom in", "Zoom out", "Reset axes"], "nothing that sends a chart anywhere"
     places = page.js("document.querySelectorAll('#place option').length")
     assert places == page.js("document.querySelectorAll('#places tbody tr').length") > 0
 

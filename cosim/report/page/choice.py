@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Hashable, Sequence
 from typing import Final, NamedTuple
 
+from cosim.core.clock import Clock
 from cosim.report.page.reasons import Mishap, event_of, mishaps_of
 from cosim.report.page.runs import ReportedRun, example_of, place_in_words, table_of_paper
 from cosim.spec.scenario import CityMap
@@ -12,6 +14,12 @@ from cosim.spec.scenario import CityMap
 MOST_FAILURES: Final = 48
 LEAST_FAILURES: Final = 24
 """So many, if there are, also where fewer show everything."""
+_START_S: Final = 15.0
+"""To start an episode and draw a failure takes about as long as to simulate so much."""
+_MOST_S: Final = 600.0
+"""So many seconds are simulated again in all."""
+_ENOUGH_ALIKE: Final = 30
+"""Of failures with the same facets so many are looked at, the earliest."""
 _OF_AN_EPISODE: Final = 40
 """Later failures of one long way are not looked at: to come there takes long."""
 
@@ -52,28 +60,51 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
 
 
 def most_telling(candidates: Sequence[FailureToShow], most: int = MOST_FAILURES) -> list[FailureToShow]:
-    """The most telling ones, the most telling first: each adds as many facets as it can, then a new place, and comes
-    early in its episode. Stops when there is nothing new, but not below LEAST_FAILURES."""
-    left = sorted(candidates, key=lambda one: (one.mishap.tick, one.scenario, one.run))
-    picked: list[FailureToShow] = []
-    seen: set[Hashable] = set()
-    places: set[str] = set()
-    episodes: set[tuple[int, str]] = set()
-    while left and len(picked) < most:
-        best = max(
-            range(len(left)),
-            key=lambda k: (
-                len(left[k].facets - seen),
-                (left[k].run, left[k].scenario) not in episodes,
-                left[k].place not in places,
-                -k,
-            ),
-        )
-        if len(picked) >= min(LEAST_FAILURES, most) and not left[best].facets - seen:
+    """The most telling ones, the most telling first: each adds as many facets as it can for the time that it takes to
+    come there, then a new episode and a new place. Stops when there is nothing new, but not below LEAST_FAILURES; what
+    would take longer than _MOST_S in all is left out."""
+    alike: Counter[frozenset[Hashable]] = Counter()
+    left: list[FailureToShow] = []
+    for one in sorted(candidates, key=lambda one: (one.mishap.tick, one.scenario, one.run)):
+        alike[one.facets] += 1
+        if alike[one.facets] <= _ENOUGH_ALIKE:
+            left.append(one)
+    choice = _Choice()
+    while left and len(choice.picked) < most:
+        best = max(left, key=choice.worth)
+        fresh = best.facets - choice.seen
+        if choice.further_s(best) > choice.room_s or (len(choice.picked) >= LEAST_FAILURES and not fresh):
             break
-        one = left.pop(best)
-        picked.append(one)
-        seen |= one.facets
-        places.add(one.place)
-        episodes.add((one.run, one.scenario))
-    return picked
+        choice.take(best)
+        left.remove(best)
+    return choice.picked
+
+
+class _Choice:
+    """What is taken so far. reached: of each episode, up to which second it is run again; room_s: what is left."""
+
+    def __init__(self) -> None:
+        self.picked: list[FailureToShow] = []
+        self.seen: set[Hashable] = set()
+        self.room_s = _MOST_S
+        self._places: set[str] = set()
+        self._reached: dict[tuple[int, str], float] = {}
+
+    def further_s(self, one: FailureToShow) -> float:
+        """How long its episode has to be simulated beyond what is taken already."""
+        return max(Clock().time_s(one.mishap.tick) - self._reached.get((one.run, one.scenario), 0.0), 0.0)
+
+    def worth(self, one: FailureToShow) -> tuple[bool, float, bool, bool]:
+        """More is better: that there is room for it, new facets for its time, a new episode, a new place."""
+        further_s = self.further_s(one)
+        new_episode = (one.run, one.scenario) not in self._reached
+        telling = len(one.facets - self.seen) / (_START_S + further_s)
+        return further_s <= self.room_s, telling, new_episode, one.place not in self._places
+
+    def take(self, one: FailureToShow) -> None:
+        self.picked.append(one)
+        self.seen |= one.facets
+        self.room_s -= self.further_s(one)
+        self._places.add(one.place)
+        key = one.run, one.scenario
+        self._reached[key] = max(self._reached.get(key, 0.0), Clock().time_s(one.mishap.tick))

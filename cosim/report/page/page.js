@@ -141,7 +141,7 @@
     for (const [kind, rings] of scene.ground) {
       c.beginPath();
       for (const ring of rings) { path(c, ring); c.closePath(); }
-      c.fillStyle = COLOURS[kind] || "#ccc"; c.fill("evenodd");
+      c.fillStyle = c.strokeStyle = COLOURS[kind] || "#ccc"; c.lineWidth = 1; c.fill("evenodd"); c.stroke();
     }
     for (const signal of scene.signals) {
       const state = signal.states[sample];
@@ -221,14 +221,14 @@
         text: of.map((s) => plain(s.words)), customdata: of.map((s) => s.entry), hovertemplate: "%{text}<extra></extra>",
         marker: { opacity: 1, size: of.map((s) => (s.entry < 0 ? 9 : 15)), color: data.causes[cause], line: { color: "#fff", width: 1.5 } } };
     });
-    const width = one("#map").clientWidth, height = Math.max(260, Math.min(width * (y1 - y0) / (x1 - x0), 760)) + 60;
+    const width = one("#map").clientWidth, height = Math.max(160, Math.min(width * (y1 - y0) / (x1 - x0), 760)) + 40;
     const still = { visible: false, range: [x0, x1] };
     const legend = { ...base.legend, itemsizing: "constant" };
     const layout = { ...base, legend, height, margin: { l: 0, r: 0, t: 34, b: 0 }, dragmode: "pan", showlegend: true, xaxis: still,
       yaxis: { visible: false, range: [y0, y1], scaleanchor: "x" },
       images: [{ source: picture.image, xref: "x", yref: "y", x: x0, y: y1, sizex: x1 - x0, sizey: y1 - y0, sizing: "stretch", layer: "below" }] };
     return Plotly.react(one("#map"), traces, layout, { responsive: true, displayModeBar: width > 600, displaylogo: false,
-      modeBarButtonsToRemove: ["select2d", "lasso2d", "toImage", "autoScale2d"] });
+      modeBarButtons: [["pan2d", "zoom2d", "zoomIn2d", "zoomOut2d", "resetScale2d"]] });
   }
   if (chooser) {
     map().then((drawing) => drawing.on("plotly_click", ({ points }) => { if (points[0].customdata >= 0) open(points[0].customdata); }));

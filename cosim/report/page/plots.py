@@ -7,11 +7,11 @@ from html import escape
 from typing import Any, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
 from cosim.core.telling import Tell, untold
-from cosim.episode.log import Log
-from cosim.records.record import Record
+from cosim.records.record import Record, Recorder
 from cosim.records.results import interval_of
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
@@ -85,27 +85,25 @@ def plots_of(runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell
     return [plot for plot in found if plot is not None]
 
 
-def near_of(log: Log) -> Floats:
-    """(T,) how many people were within NEAR_M of the robot, as recorded once a second."""
-    counts = np.zeros(len(log))
-    ticks = np.unique(log.people_tick)
-    if not len(ticks):
-        return counts
-    every = int(np.diff(ticks).min()) if len(ticks) > 1 else len(log)
-    away = log.people_xy - log.pose[np.minimum(log.people_tick, len(log) - 1), :2]
-    close = log.people_tick[np.hypot(away[:, 0], away[:, 1]) < NEAR_M]
-    by_tick = np.bincount(close, minlength=len(log))
-    return by_tick[np.arange(len(log)) // every * every].astype(float)
+def near_of(pose: Floats, people_tick: NDArray[np.int64], people_xy: Floats) -> Floats:
+    """(T,) how many people were within NEAR_M of the robot, as recorded once a second; columns of `Log`."""
+    away = people_xy - pose[people_tick, :2]
+    close = people_tick[np.hypot(away[:, 0], away[:, 1]) < NEAR_M]
+    every = Recorder.PEOPLE_EVERY_TICKS
+    by_tick = np.bincount(close, minlength=len(pose))
+    return by_tick[np.arange(len(pose)) // every * every].astype(float)
 
 
-def exposure_of(record: Record, log: Log, value: Floats, edges: Sequence[float], *, moving: bool) -> Exposure:
-    """Failures and metres of an episode by a value that it has at each tick, (T,). moving: freezings, which have no
-    metres, are left out."""
+def exposure_of(
+    record: Record, travelled_m: Floats, value: Floats, edges: Sequence[float], *, moving: bool
+) -> Exposure:
+    """Failures and metres of an episode by a value that it has at each tick, (T,). travelled_m: (T,) of each tick.
+    moving: freezings, which have no metres, are left out."""
     bins = np.digitize(value, edges)
-    ticks = [f.tick for f in record.failures if f.tick < len(log) and not (moving and f.kind == "freezing")]
+    ticks = [f.tick for f in record.failures if f.tick < len(value) and not (moving and f.kind == "freezing")]
     count = len(edges) + 1
     failures = np.bincount(bins[np.array(ticks, dtype=int)], minlength=count).astype(float)
-    return Exposure(failures, np.bincount(bins, weights=log.travelled_m, minlength=count).astype(float))
+    return Exposure(failures, np.bincount(bins, weights=travelled_m, minlength=count).astype(float))
 
 
 _ByRun = dict[tuple[str, PaperTable], list[Exposure]]
@@ -117,13 +115,14 @@ def _exposures(runs: Sequence[ReportedRun], tell: Tell) -> tuple[_ByRun, _ByRun]
     fast: _ByRun = {}
     for number, run in enumerate(runs):
         tell("reading trajectories", number / len(runs))
-        for record, log in run.logs():
+        for record, track in run.tracks():
             key = run.label, table_of_paper(run.scenarios[record.scenario])
+            travelled_m, speed = track["travelled_m"], np.abs(track["speed"][:, 0])
             if key[1] == "long":
-                near.setdefault(key, []).append(exposure_of(record, log, near_of(log), _NEAR_EDGES, moving=False))
-            speed = np.abs(log.speed[:, 0])
+                people = near_of(track["pose"], track["people_tick"], track["people_xy"])
+                near.setdefault(key, []).append(exposure_of(record, travelled_m, people, _NEAR_EDGES, moving=False))
             began = np.concatenate([speed[:1], speed[:-1]])
-            fast.setdefault(key, []).append(exposure_of(record, log, began, _SPEED_EDGES, moving=True))
+            fast.setdefault(key, []).append(exposure_of(record, travelled_m, began, _SPEED_EDGES, moving=True))
     return near, fast
 
 

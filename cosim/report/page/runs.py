@@ -7,8 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final, Literal
+from typing import Any, Final, Literal
+from zipfile import BadZipFile
 
+import numpy as np
 import pandas as pd
 
 from cosim.core.errors import RunError, UsageError
@@ -22,6 +24,8 @@ from cosim.spec.scenario import CityMap, Light, Scenario
 
 PaperTable = Literal["unit", "reactive", "long"]
 """Short ways past things; short ways with one event, or the same without; long ways, which go on after a failure."""
+TRACK: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
+"""What plots are made of: to read all that a log holds takes four times as long."""
 KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
 _OVERCAST: Final = 0.8
 _LOW_SUN_DEG: Final = 20.0
@@ -76,11 +80,19 @@ class ReportedRun:
         except RunError as error:
             raise RunError(f"{error}: {anew(file)}") from error
 
-    def logs(self) -> Iterator[tuple[Record, Log]]:
-        """The episodes that have a trajectory."""
+    def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
+        """The arrays called TRACK of the episodes that have a trajectory. Raises RunError for a damaged one."""
         for record in self.records:
-            if record.ended is not None and (log := self.log(record.scenario)) is not None:
-                yield record, log
+            file = record_file(self.path, record.scenario)
+            path = file.with_name("trajectory.npz")
+            if record.ended is None or not path.exists():
+                continue
+            try:
+                with np.load(path, allow_pickle=False) as arrays:
+                    read = {name: arrays[name] for name in TRACK}
+            except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+                raise RunError(f"{path}: not a trajectory: {error}: {anew(file)}") from error
+            yield record, read
 
 
 def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
@@ -97,11 +109,11 @@ def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
     _refuse_other_suites(found)
     policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]
     folders = [whole.path.name for whole in found]
-    alike = {policy for suite, policy in policies if policies.count((suite, policy)) > 1}
+    alike = {policy for policy in policies if policies.count(policy) > 1}
     names = [path.name if folders.count(path.name) == 1 else str(path) for path in paths]
     return [
-        ReportedRun(name if whole.spec.policy_name in alike else whole.spec.policy_name, whole)
-        for whole, name in zip(found, names, strict=True)
+        ReportedRun(name if policy in alike else policy[1], whole)
+        for whole, name, policy in zip(found, names, policies, strict=True)
     ]
 
 

@@ -221,7 +221,7 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 
 def _marks(table: pd.DataFrame) -> str:
     """What a reader must know of a row: how many episodes, and who knew more than a robot can."""
-    notes = [f"{len(table)} episodes"]
+    notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
     notes += ["privileged"] * bool(table["privileged"].any())
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
     return f"<small>{', '.join(notes)}</small>"
