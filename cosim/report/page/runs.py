@@ -24,7 +24,7 @@ from cosim.spec.scenario import CityMap, Light, Scenario
 
 PaperTable = Literal["unit", "reactive", "long"]
 """Short ways past things; short ways with one event, or the same without; long ways, which go on after a failure."""
-TRACK: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
+_COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
 """What plots are made of: to read all that a log holds takes four times as long."""
 KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
 _OVERCAST: Final = 0.8
@@ -81,7 +81,7 @@ class ReportedRun:
             raise RunError(f"{error}: {anew(file)}") from error
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
-        """The arrays called TRACK of the episodes that have a trajectory. Raises RunError for a damaged one."""
+        """_COLUMNS of the log of each episode that has a trajectory. Raises RunError for a damaged one."""
         for record in self.records:
             file = record_file(self.path, record.scenario)
             path = file.with_name("trajectory.npz")
@@ -89,7 +89,7 @@ class ReportedRun:
                 continue
             try:
                 with np.load(path, allow_pickle=False) as arrays:
-                    read = {name: arrays[name] for name in TRACK}
+                    read = {name: arrays[name] for name in _COLUMNS}
             except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
                 raise RunError(f"{path}: not a trajectory: {error}: {anew(file)}") from error
             yield record, read
