@@ -13,16 +13,18 @@ from typing import NamedTuple
 import numpy as np
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats, Pose
+from cosim.core.geometry import Floats, Polyline
 from cosim.episode.in_flight import median_ms
 from cosim.episode.log import Log
-from cosim.episode.loop import place_on_route
+from cosim.episode.loop import ROUTE_WINDOW_M
 from cosim.judge.referee import STOP_S, FreezeWindow, at_goal
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.records.record import Ended, Record
 from cosim.spec.scenario import Scenario
 
 _ROUNDING_M = 1e-9
+_BLOCK_TICKS = 2000
+"""So many at a time need a few MiB."""
 
 
 class Contradiction(NamedTuple):
@@ -81,17 +83,39 @@ def _way(scenario: Scenario, log: Log) -> Iterator[Contradiction]:
     """Arc lengths are those of the poses, and no tick went farther than was travelled in it."""
     reset_to_m = _before(log.reset_s_m, 0.0)
     last_m = np.where(np.isnan(reset_to_m), _before(log.route_s_m, 0.0), reset_to_m)
-    for k, (pose, before_m, s_m) in enumerate(
-        zip(log.pose.tolist(), last_m.tolist(), log.route_s_m.tolist(), strict=True)
-    ):
-        if (shown := place_on_route(scenario.route_line, Pose(*pose), before_m)) != s_m:
-            yield Contradiction(f"route_s_m at tick {k}", s_m, shown)
-            return
+    shown_m = places_on_route(scenario.route_line, log.pose, last_m)
+    if len(apart := np.flatnonzero(shown_m != log.route_s_m)):
+        k = int(apart[0])
+        yield Contradiction(f"route_s_m at tick {k}", float(log.route_s_m[k]), float(shown_m[k]))
+        return
     went_m = np.hypot(*np.diff(log.pose[:, :2], axis=0).T)
     short = np.flatnonzero((went_m > log.travelled_m[1:] + _ROUNDING_M) & np.isnan(log.reset_s_m[:-1])) + 1
     if len(short):
         k = int(short[0])
         yield Contradiction(f"travelled_m at tick {k}", float(log.travelled_m[k]), f"{went_m[k - 1]} or more")
+
+
+def places_on_route(route: Polyline, pose: Floats, last_s_m: Floats) -> Floats:
+    """(T,) what `cosim.episode.loop.place_on_route` gives, to the bit, for (T, 3) poses and last arc lengths (T,)."""
+    first = np.maximum(np.searchsorted(route.s_m, last_s_m - ROUTE_WINDOW_M, side="right") - 1, 0)
+    steps = np.diff(route.points, axis=0)
+    lengths = np.hypot(steps[:, 0], steps[:, 1])
+    directions = steps / lengths[:, None]
+    first = np.minimum(first, len(lengths) - 1)
+    last = np.minimum(np.searchsorted(route.s_m, last_s_m + ROUTE_WINDOW_M, side="left"), len(lengths))
+    last = np.maximum(last, first + 1)
+    found = np.empty(len(pose))
+    for block in np.array_split(np.arange(len(pose)), len(pose) // _BLOCK_TICKS + 1):
+        segment = first[block][:, None] + np.arange((last - first)[block].max(initial=1))
+        inside = segment < last[block][:, None]
+        segment = np.minimum(segment, len(lengths) - 1)
+        dx, dy = (pose[block, None, axis] - route.points[segment, axis] for axis in (0, 1))
+        along = np.maximum(dx * directions[segment, 0] + dy * directions[segment, 1], 0.0)
+        along = np.minimum(along, lengths[segment])
+        ox, oy = dx - along * directions[segment, 0], dy - along * directions[segment, 1]
+        nearest = np.arange(len(block)), np.argmin(np.where(inside, ox * ox + oy * oy, np.inf), axis=1)
+        found[block] = route.s_m[segment[nearest]] + along[nearest]
+    return found
 
 
 def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contradiction]:
