@@ -20,7 +20,7 @@ from cosim.report.page.choice import most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER
 from cosim.report.page.plots import exposure_of, near_of, plots_of
-from cosim.report.page.runs import read_runs
+from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import tables_html
 from cosim.spec.scenario import read_suite
@@ -59,15 +59,18 @@ class Elements(HTMLParser):
 
 
 def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
-    """Success of straight ways, with its interval, stands in the row of the policy; the paper's rows are marked."""
-    run = run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")
-    (told,) = read_runs([run])
+    """Success of straight ways, with its interval, stands in the row of the policy; the paper's rows are marked, and
+    stand only beside those of its suites."""
+    (own,) = read_runs([run_of(tmp_path / "run", ["goal", HIT, HIT, "goal", "goal"], "mine")])
+    spec = msgspec.structs.replace(own.spec, suite="unit")
+    told = ReportedRun("mine", own.whole._replace(spec=spec))
     mean, low, high, _ = summary_of(told.table, ["success"]).iloc[0]
     text = tables_html([told])
     (row,) = re.findall(r'<tr><th scope="row">mine.*?</tr>', text)
     assert f">{mean:.2f}<small>{low:.2f}&ndash;{high:.2f}</small>" in row and mean == 0.6
     assert text.index("the paper's models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
+    assert 'class="paper"' not in tables_html([own]) and "mine: straight" in tables_html([own])
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")

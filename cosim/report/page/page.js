@@ -214,6 +214,7 @@
   const chooser = one("#place");
   function map() {
     const picture = data.maps.pictures[Number(chooser.value)], spots = data.maps.spots[picture.place] || [];
+    one("#map-name").textContent = picture.place;
     const [x0, y0, x1, y1] = picture.bounds, causes = [...new Set(spots.map((s) => s.cause))];
     const traces = causes.map((cause) => {
       const of = spots.filter((s) => s.cause === cause);

@@ -156,9 +156,10 @@ def _places(maps: Maps) -> str:
         f'<option value="{k}">{escape(p.place)}: {len(maps.spots.get(p.place, ()))} failures</option>'
         for k, p in enumerate(maps.pictures)
     )
+    drawing = '<div id="map" class="drawing" role="img" aria-label="Failures on the map"></div>'
     chooser = (
         f'<div class="filters"><label>place<select id="place">{options}</select></label></div>'
-        '<figure class="plot"><div id="map" class="drawing" role="img" aria-label="Failures on the map"></div></figure>'
+        f'<figure class="plot"><h3 id="map-name"></h3>{drawing}</figure>'
         if options
         else ""
     )

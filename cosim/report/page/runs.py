@@ -26,6 +26,8 @@ PaperTable = Literal["unit", "reactive", "long"]
 """Short ways past things; short ways with one event, or the same without; long ways, which go on after a failure."""
 _COLUMNS: Final = ("pose", "speed", "travelled_m", "people_tick", "people_xy")
 """What plots are made of: to read all that a log holds takes four times as long."""
+OF_THE_PAPER: Final = ("unit", "reactive", "long-horizon")
+"""The suites whose rows stand beside the paper's."""
 KINDS_OF_LIGHT: Final = ("high sun", "low sun", "overcast", "fog")
 _OVERCAST: Final = 0.8
 _LOW_SUN_DEG: Final = 20.0
@@ -33,8 +35,9 @@ _LOW_SUN_DEG: Final = 20.0
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """One run. label: what it is called on the page: its policy, or its folder where two runs of a suite have the same
-    policy. table: a row per episode with the columns of `table_of` and kind, family, place, real, light."""
+    """One run. label: what it is called on the page: its policy; with the suite, for one's own suite beside others; its
+    folder, where two runs of a suite have the same policy. table: a row per episode with the columns of `table_of` and
+    kind, family, place, real, light."""
 
     label: str
     whole: WholeRun
@@ -108,12 +111,17 @@ def read_runs(paths: Sequence[Path], tell: Tell = untold) -> list[ReportedRun]:
         found.append(read_whole_run(path))
     _refuse_other_suites(found)
     policies = [(whole.spec.suite, whole.spec.policy_name) for whole in found]
+    suites = {policy: {suite for suite, other in policies if other == policy} for _, policy in policies}
     folders = [whole.path.name for whole in found]
     alike = {policy for policy in policies if policies.count(policy) > 1}
     names = [path.name if folders.count(path.name) == 1 else str(path) for path in paths]
+    labels = [
+        f"{policy}, {suite}" if suite not in OF_THE_PAPER and len(suites[policy]) > 1 else policy
+        for suite, policy in policies
+    ]
     return [
-        ReportedRun(name if policy in alike else policy[1], whole)
-        for whole, name, policy in zip(found, names, policies, strict=True)
+        ReportedRun(name if policy in alike else label, whole)
+        for whole, name, policy, label in zip(found, names, policies, labels, strict=True)
     ]
 
 

@@ -12,7 +12,7 @@ import pandas as pd
 
 from cosim.records.results import not_to_be_quoted, summary_of
 from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER, Row
-from cosim.report.page.runs import PaperTable, ReportedRun
+from cosim.report.page.runs import OF_THE_PAPER, PaperTable, ReportedRun
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
 EVENT_COLUMNS: Final = (
@@ -151,19 +151,19 @@ def _other(runs: Sequence[ReportedRun]) -> str:
     found: dict[str, pd.DataFrame] = {}
     for run in runs:
         for (family, kind), part in run.table.groupby(["family", "kind"], sort=False):
-            if kind not in known[str(family)]:
+            if run.spec.suite not in OF_THE_PAPER or kind not in known[str(family)]:
                 found[f"{run.label}: {kind}"] = part
     if not found:
         return ""
     columns = [_Column("", "", head, {}, metric) for metric, head in (_SHARES | RATES).items()]
-    return _framed("Other scenarios", "", columns, found, {})
+    return _framed("Other suites and kinds", "As above, by what the scenarios are examples of.", columns, found, {})
 
 
 def _table(
     title: str, note: str, runs: Sequence[ReportedRun], family: PaperTable, columns: Sequence[_Column],
     paper: Mapping[str, Row],
 ) -> str:  # fmt: skip
-    ours = episodes_of(runs, family)
+    ours = episodes_of([run for run in runs if run.spec.suite in OF_THE_PAPER], family)
     return _framed(title, note, columns, ours, paper) if ours else ""
 
 
@@ -222,6 +222,7 @@ def _part(table: pd.DataFrame, column: _Column) -> pd.DataFrame:
 def _marks(table: pd.DataFrame) -> str:
     """What a reader must know of a row: how many episodes, and who knew more than a robot can."""
     notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
+    notes += ["crowd added"] * bool(table["crowd_added"].any())
     notes += ["privileged"] * bool(table["privileged"].any())
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
     return f"<small>{', '.join(notes)}</small>"
