@@ -53,6 +53,7 @@ def test_the_wheel_holds_what_a_run_needs(tmp_path: Path) -> None:
         for path in (ROOT / room).rglob("*.py"):
             assert path.relative_to(ROOT).as_posix() in names
     needed = {"scenarios/suites/long-horizon.json", "physics/robots/courier.urdf", "scenarios/own/template.toml"}
+    assert {f"cosim/report/page/{name}" for name in ("page.css", "page.js", "viewer.html")} <= names
     assert needed <= names
     assert not [n for n in names if n.split("/")[0] not in ROOMS and ".dist-info" not in n]
 

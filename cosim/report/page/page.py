@@ -58,6 +58,8 @@ def page_of(
         del sections["failures"]
     if not maps.spots:
         del sections["places"]
+    if not plots:
+        del sections["plots"]
     nav = "".join(f'<a href="#{name}">{words}</a>' for name, (words, _) in sections.items())
     body = "".join(
         f'<section id="{name}"><h2>{words}</h2>{inner}</section>' for name, (words, inner) in sections.items()
@@ -174,10 +176,10 @@ def _places(maps: Maps) -> str:
         )
     heads = '<th scope="col">place</th><th scope="col">episodes</th><th scope="col">failed</th>'
     heads += '<th scope="col" class="word">what went wrong</th>'
-    listed = wide_html("All places", f"<tr>{heads}</tr>", rows)
+    listed = wide_html("Every place", f"<tr>{heads}</tr>", rows)
     return (
         f'<p class="intro">Dots are failures; the large ones open.</p>{chooser}'
-        f"<details><summary>All {len(maps.episodes)} places</summary>{listed}</details>"
+        f"<details><summary>Every place ({len(maps.episodes)})</summary>{listed}</details>"
     )
 
 
