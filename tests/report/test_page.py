@@ -95,13 +95,13 @@ def test_the_papers_figures_are_those_of_its_tables() -> None:
 
 def test_the_gallery_shows_every_kind_and_cause_and_no_more_than_asked_for(tmp_path: Path) -> None:
     """Of many failures of few kinds one of each is chosen first, the earliest; the bound holds."""
-    kinds = [("straight", "curve", "crosswalk")[i % 3] for i in range(27)]
+    kinds = [("straight", "curve", "crosswalk")[i % 3] for i in range(38)]
     ways = [short_way(f"s-{i:03d}", structure=kind) for i, kind in enumerate(kinds)]
-    runs = read_runs([run_of(tmp_path / "run", [HIT] * 27, "mine", ways)])
+    runs = read_runs([run_of(tmp_path / "run", [HIT] * 38, "mine", ways)])
     candidates = shown_of(runs)
     picked = most_telling(candidates, 3)
-    assert len(candidates) == 27 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
-    assert len(most_telling(candidates, 48)) == 24 and len({one.scenario for one in most_telling(candidates, 48)}) == 24
+    assert len(candidates) == 38 and {kinds[int(one.scenario[2:])] for one in picked} == {*kinds}
+    assert len(most_telling(candidates, 48)) == 36 and len({one.scenario for one in most_telling(candidates, 48)}) == 36
 
 
 def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_much(tmp_path: Path) -> None:

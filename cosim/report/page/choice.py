@@ -12,7 +12,7 @@ from cosim.report.page.runs import ReportedRun, example_of, place_in_words, tabl
 from cosim.spec.scenario import CityMap
 
 MOST_FAILURES: Final = 48
-LEAST_FAILURES: Final = 24
+LEAST_FAILURES: Final = 36
 """So many, if there are, also where fewer show everything."""
 _START_S: Final = 15.0
 """To start an episode and draw a failure takes about as long as to simulate so much."""
