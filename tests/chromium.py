@@ -99,9 +99,9 @@ class Page:
         match told.get("method"):
             case "Runtime.exceptionThrown":
                 self.wrong.append(str(about["exceptionDetails"]))
-            case "Runtime.consoleAPICalled" if about["type"] in ("error", "assert", "warning"):
+            case "Runtime.consoleAPICalled" if about["type"] in ("error", "assert"):
                 self.wrong.append(str(about["args"]))
-            case "Log.entryAdded" if about["entry"]["level"] in ("error", "warning"):
+            case "Log.entryAdded" if about["entry"]["level"] == "error":
                 self.wrong.append(str(about["entry"]))
             case "Network.requestWillBeSent" if not about["request"]["url"].startswith(("data:", "blob:", "file:")):
                 self.asked.append(about["request"]["url"])
