@@ -26,7 +26,8 @@ _LATER_M_PER_S: Final = 0.04
 _REACH_M: Final = 0.3
 _NEAR_M: Final = 1.5
 _SOON: Final = 4
-"""Who is so near is foreseen to stay there, too, for so many steps."""
+_DARTS_M: Final = 0.15
+"""Who is so near is foreseen to stay there, too, for so many steps, or to have come so much nearer by a step aside."""
 _COMES_M: Final = 4.5
 _COMES_RAD: Final = 0.12
 """Who ahead walks at the robot so exactly, and is so near, is waited for (not the crowd, which would wait too),"""
@@ -68,7 +69,8 @@ def gaps_to_people(known: Privileged, robot: Robot, ahead: Ahead, people: People
         if xy.shape[1]:
             squared = np.minimum(squared, _squared(xy[:, None], x, y))
         if len(near):
-            squared[:_SOON] = np.minimum(squared[:_SOON], _squared(near, x[:_SOON], y[:_SOON]))
+            beside = np.maximum(np.sqrt(_squared(near, x[:_SOON], y[:_SOON])) - _DARTS_M, 0.0)
+            squared[:_SOON] = np.minimum(squared[:_SOON], beside**2)
         if len(ends):
             squared = np.minimum(squared, distances(np.stack([x, y], axis=-1), ends).min(axis=-1) ** 2)
     gaps: Floats = np.sqrt(squared) - PERSON_RADIUS_M - disks.radius_m

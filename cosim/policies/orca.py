@@ -67,6 +67,8 @@ _SOON: Final = 5
 """So many steps of two STEP_S a plan is kept off what is solid; later ones will be chosen anew."""
 _JUMP_M: Final = 1.0
 _STRAYED_M: Final = 2.6
+_PAST_END_M: Final = 0.05
+"""A robot nearer to the end of its line than this has missed the goal and is led back."""
 _PATIENCE_S: Final = 3.0
 _LED_ANEW_S: Final = 1.6
 """Who has not come on for so long, and somebody stands near, looks for another way."""
@@ -194,7 +196,7 @@ class Orca:
             self._led_anew_s = self._stuck_s + _PATIENCE_S
         if not blocked and here is not None and not jumped:
             s_m, lateral_m = self._line.project(x_m, y_m, (here.s_m - 2.0, here.s_m + 3.0))
-            if abs(lateral_m) < _STRAYED_M:
+            if abs(lateral_m) < _STRAYED_M and s_m < here.way.length_m - _PAST_END_M:
                 self._here = here._replace(s_m=s_m)
                 return self._here
         guide = self._guide[1]

@@ -155,3 +155,10 @@ def test_another_way_is_found_where_somebody_stands_in_the_first() -> None:
     assert math.dist(track[-1, :2], course.route.points[-1]) < 1.0
     assert min(body.distance(Point(15.0, 1.55)) for body in bodies(track)) > 0.3
     assert min(course.solid.distance(body) for body in bodies(track)) > 0.0
+
+
+def test_a_robot_that_was_kept_off_the_goal_comes_back_to_it() -> None:
+    """Two who talk just before the goal are passed at more than a metre from it; behind them the robot turns round."""
+    talkers = People.of(("p0", "p1"), [(19.6, -0.15), (19.6, 1.3)], [0.0, 0.0], [0.0, 0.0], ("talk", "talk"))
+    track = driven(straight(width_m=3.6), Pose(5.0, 0.0, 0.0), people=talkers)
+    assert math.dist(track[-1, :2], (20.0, 0.0)) < 1.0
