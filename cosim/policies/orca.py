@@ -61,7 +61,7 @@ EDGE_COST: Final = 6.0
 _EDGE_M: Final = 0.06
 _SOLID_M: Final = 0.05
 """Nearer to the edge than this a corner of the body may touch what stands there."""
-_SOLID_COST: Final = 30.0
+_SOLID_COST: Final = 60.0
 _DEEP_M: Final = 0.4
 _SOON: Final = 5
 """So many steps of two STEP_S a plan is kept off what is solid; later ones will be chosen anew."""
