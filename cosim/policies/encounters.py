@@ -1,7 +1,8 @@
 """How near the robot's plans bring it to people, and whom it waits for.
 
 People are taken to walk on as they walk. Besides, who is near may stay where it is, and who walks the robot's way may
-slow down. For who walks straight at the robot from near it stands until they have passed: people go round what stands.
+slow down. For who walks straight at the robot from near, or crosses and would meet it, it stands until they have
+passed: people go round what stands, and go first.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import math
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.state import DIRECTED, PERSON_RADIUS_M, People
@@ -31,6 +33,9 @@ _DARTS_M: Final = 0.15
 _COMES_M: Final = 4.5
 _COMES_RAD: Final = 0.12
 """Who ahead walks at the robot so exactly, and is so near, is waited for (not the crowd, which would wait too),"""
+_SIDEWAYS: Final = 0.7
+_MET_M: Final = 0.6
+"""and who walks across, by such a share of its pace, and would pass the robot's middle so near,"""
 _LEAVES_RAD: Final = 1.7
 _PAST_M: Final = 1.4
 """until it walks away, and is so far behind or off: who is still beside the robot may turn to it anew,"""
@@ -91,8 +96,22 @@ def bodies(ahead: Ahead, disks: BodyDisks) -> tuple[tuple[Floats, Floats], tuple
     return (x + nose_x, y + nose_y), (x - nose_x, y - nose_y)
 
 
+def _crosses(known: Privileged, offset: Floats) -> NDArray[np.bool_]:
+    """(N,): who comes from a side, and would meet the robot if both kept their velocity."""
+    pose, people = known.robot.pose, known.people
+    forward = np.array([math.cos(pose.heading_rad), math.sin(pose.heading_rad)])
+    velocity = walks(people)
+    sideways = np.abs(velocity @ [-forward[1], forward[0]]) > _SIDEWAYS * people.speed
+    closing = velocity - known.robot.v_mps * forward
+    speed = np.maximum(np.hypot(closing[:, 0], closing[:, 1]), 1e-6)
+    missed_m = np.abs(offset[:, 0] * closing[:, 1] - offset[:, 1] * closing[:, 0]) / speed
+    met: NDArray[np.bool_] = sideways & ((offset * closing).sum(axis=1) < 0.0) & (missed_m < _MET_M)
+    return met
+
+
 class Yielding:
-    """Whom the robot stands for: who came straight at it, until past it; no longer than _WAITS_S in one place."""
+    """Whom the robot stands for: who came straight at it, or across, until past it; no longer than _WAITS_S in one
+    place."""
 
     def __init__(self) -> None:
         self._for: set[str] = set()
@@ -107,7 +126,8 @@ class Yielding:
         off = np.abs(wrap_angles(people.heading - np.arctan2(-offset[:, 1], -offset[:, 0])))
         ahead = offset @ [cos, sin]
         near = (far < _COMES_M) & (ahead > -_PAST_M)
-        comes = near & people.are(*DIRECTED) & ~who_stands(people) & (off < _COMES_RAD) & (ahead > 0.5 * far)
+        comes = (off < _COMES_RAD) | _crosses(known, offset)
+        comes &= near & people.are(*DIRECTED) & ~who_stands(people) & (ahead > 0.5 * far)
         passing = near & ((off < _LEAVES_RAD) | (far < _PAST_M))
         if math.dist(self._at, pose[:2]) > _SAME_PLACE_M:
             self._at, self._since_s = pose[:2], time_s

@@ -13,7 +13,7 @@ The route is led round what stands on it for good (`guide`). Each time it acts:
    while the body stays clear of everybody and on free ground (`clearance`).
 
 Red signals, cars near a crossing and a stopping hand limit the speed so that it comes to rest before them; for who
-walks straight at it from near it stands, since people go round a robot that does.
+walks straight at it from near, or across its way, it stands, since people go round a robot that does.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ class Here(NamedTuple):
 class Orca:
     """Anticipates, yields, goes round groups, stops for a hand: the oracle; knows what no camera sees."""
 
-    manifest = Manifest("orca", version="2", rate_hz=5.0, camera=None, privileged=True)
+    manifest = Manifest("orca", version="3", rate_hz=5.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)

@@ -63,6 +63,7 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
     """One person of an event. aim_rad, pace_mps: the heading and the speed it has committed to, if it has.
 
     blocked_ticks: how long it has stood against the robot. counted_ticks: how long that lasts which ends its event.
+    nearest_m: how near the robot has come to it from behind since it slowed down before it.
     vx_mps, vy_mps: of its last step.
     """
 
@@ -73,6 +74,7 @@ class Walker(msgspec.Struct, frozen=True, kw_only=True):
     pace_mps: float | None = None
     blocked_ticks: int = 0
     counted_ticks: int = 0
+    nearest_m: float | None = None
     vx_mps: float = 0.0
     vy_mps: float = 0.0
 

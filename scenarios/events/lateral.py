@@ -1,7 +1,9 @@
 """`lateral`: crosses the robot's projected path at a right angle, to be where the robot is if that keeps its velocity.
 
-Direction and speed are fixed at the trigger, and anew where it had to step round somebody. It walks to the other edge
-of the sidewalk and on along it.
+Its direction is fixed at the trigger, and anew where it had to step round somebody; its pace goes with the robot's: it
+slows down as the robot does, and stands when the robot stands. So a robot that happens to slow down now and then has
+not let it cross. One that has stood for it is given way to no longer: it crosses, walks to the other edge of the
+sidewalk, and on along it.
 """
 
 from __future__ import annotations
@@ -11,6 +13,8 @@ from typing import Final
 
 import msgspec
 
+from cosim.core.state import PERSON_RADIUS_M
+from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.spec.event_kind import EventKind, SidewalkLayout
 from cosim.spec.events import Event, EventQuery, EventState, Walker
 from scenarios.events.sight import sight_of
@@ -19,6 +23,10 @@ from scenarios.events.walking import edge_m, gave_up, pressed_on, walked_on, wal
 SLOWEST_MPS: Final = 0.05
 _FASTEST_MPS: Final = 2.0
 """However slow the robot, it is met; nobody runs faster than this."""
+_SQUARE: Final = 0.3
+"""Sine of the angle between their ways, at least, for them to meet at all."""
+LET_CROSS_S: Final = 2.5
+"""Who crosses goes first once the robot has stood for so long."""
 
 
 def _begin(event: Event, number: int) -> Walker:
@@ -29,10 +37,17 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     walker, sight = state.walkers[number], sight_of(event, number, query)
     if state.phase == "over":
         return walked_on(walker, event.heading_rad + math.pi, event.speed_mps, sight)
+    across_rad = event.heading_rad - event.side * math.pi / 2
+    if state.robot_stood_ticks * query.tick_ms >= 1000 * LET_CROSS_S:
+        return msgspec.structs.replace(walked_on(walker, across_rad, event.speed_mps, sight), aim_rad=None)
     if walker.aim_rad is None or walker.pace_mps is None:
         aim_rad, pace_mps = _course(event, walker, query)
         walker = msgspec.structs.replace(walker, aim_rad=aim_rad, pace_mps=pace_mps)
-        assert walker.aim_rad is not None and walker.pace_mps is not None
+    elif (now_mps := _pace_to_meet(walker, walker.aim_rad, query)) is not None:
+        if query.robot_v_mps < ROBOT_STANDS_MPS:
+            return walker
+        walker = msgspec.structs.replace(walker, pace_mps=now_mps)
+    assert walker.aim_rad is not None and walker.pace_mps is not None
     return pressed_on(walker, walker.aim_rad, walker.pace_mps, sight)
 
 
@@ -54,6 +69,21 @@ def _course(event: Event, walker: Walker, query: EventQuery) -> tuple[float, flo
     if passed or math.cos(aim_rad - across_rad) <= 0.0:
         return across_rad, walker.pace_mps
     return aim_rad, pace_mps
+
+
+def _pace_to_meet(walker: Walker, aim_rad: float, query: EventQuery) -> float | None:
+    """Metres a second at which the walker is on the robot's line when the robot is there; None once it is there, or the
+    robot past it."""
+    cos, sin = math.cos(query.robot_heading_rad), math.sin(query.robot_heading_rad)
+    dx, dy = walker.x_m - query.robot_x_m, walker.y_m - query.robot_y_m
+    across = cos * math.sin(aim_rad) - sin * math.cos(aim_rad)
+    if abs(across) < _SQUARE:
+        return None
+    to_line_m = (sin * dx - cos * dy) / across
+    ahead_m = cos * (dx + math.cos(aim_rad) * to_line_m) + sin * (dy + math.sin(aim_rad) * to_line_m)
+    if to_line_m <= PERSON_RADIUS_M or ahead_m <= 0.0:
+        return None
+    return min(max(to_line_m * query.robot_v_mps / ahead_m, SLOWEST_MPS), _FASTEST_MPS)
 
 
 def collision_course(walker: Walker, query: EventQuery, side: int) -> tuple[float, float]:

@@ -1,8 +1,8 @@
 """`overtaking`: sets out when the robot has just passed it, comes from behind, faster, passes close by, and cuts in.
 
-Before the robot it slows down to half of the robot's speed. A robot that only keeps its course at whatever speed runs
-into it then; one that slows down for it, or goes round it, does not. Once it has been let in it walks on at its own
-pace.
+Before the robot it slows down to half of the robot's speed, whatever that becomes. A robot that only keeps its course,
+at whatever speed or by fits and starts, runs into it then; one that slows down for it until it has been let in, or goes
+round it, does not. Then it walks on at its own pace.
 """
 
 from __future__ import annotations
@@ -28,10 +28,12 @@ _BEFORE_ROBOT_M: Final = 1.5
 """Its lead when it turns to the robot's line, and when it slows down there."""
 ON_LINE_M: Final = 0.15
 SLOWED: Final = 0.5
-_CREEPS_MPS: Final = 0.15
-YIELDED_S: Final = 3.0
-YIELDS_MPS: Final = 0.05
-"""A robot that for so long has come up to it no faster than this has let it in."""
+_CREEPS_MPS: Final = 0.1
+_EASES_MPS2: Final = 0.6
+"""How fast its pace goes with the robot's from then on."""
+YIELDED_S: Final = 5.0
+_NEARER_M: Final = 0.1
+"""A robot that for so long has not come nearer by this has let it in."""
 _LOOK_AHEAD_M: Final = 1.5
 
 
@@ -44,19 +46,32 @@ def _step(event: Event, state: EventState, number: int, query: EventQuery) -> Wa
     if state.phase == "over":
         return walked_on(walker, event.heading_rad, event.speed_mps, sight)
     if walker.pace_mps is not None:
-        yields = query.robot_v_mps <= walker.pace_mps + YIELDS_MPS
-        slow = msgspec.structs.replace(walker, counted_ticks=walker.counted_ticks + 1 if yields else 0)
-        return pressed_on(slow, event.heading_rad, walker.pace_mps, sight)
+        return pressed_on(_eased(event, walker, query), event.heading_rad, walker.pace_mps, sight)
     lead_m, line_m = _lead_m(event, walker, query), left_m(event, query.robot_x_m, query.robot_y_m)
     if walker.aim_rad is None and lead_m >= _CUTS_IN_M:
         walker = msgspec.structs.replace(walker, aim_rad=event.heading_rad)
     if walker.aim_rad is None:
         line_m = _beside_m(event, line_m)
     elif lead_m >= _BEFORE_ROBOT_M and abs(left_m(event, walker.x_m, walker.y_m) - line_m) < ON_LINE_M:
-        return msgspec.structs.replace(walker, pace_mps=max(SLOWED * query.robot_v_mps, _CREEPS_MPS))
+        return msgspec.structs.replace(walker, pace_mps=_slowed_mps(query))
     pace_mps = min(max(event.speed_mps, query.robot_v_mps + _FASTER_MPS), _FASTEST_MPS)
     aim = spot(event, along_m(event, walker.x_m, walker.y_m) + _LOOK_AHEAD_M, line_m)
     return walked_to(walker, *aim, pace_mps, sight)
+
+
+def _eased(event: Event, walker: Walker, query: EventQuery) -> Walker:
+    """Its pace goes with the robot's; it counts how long the robot has come no nearer."""
+    assert walker.pace_mps is not None
+    change_mps = _EASES_MPS2 * query.tick_ms / 1000
+    pace_mps = walker.pace_mps + max(-change_mps, min(change_mps, _slowed_mps(query) - walker.pace_mps))
+    lead_m = _lead_m(event, walker, query)
+    if walker.nearest_m is None or lead_m < walker.nearest_m - _NEARER_M:
+        return msgspec.structs.replace(walker, pace_mps=pace_mps, nearest_m=lead_m, counted_ticks=0)
+    return msgspec.structs.replace(walker, pace_mps=pace_mps, counted_ticks=walker.counted_ticks + 1)
+
+
+def _slowed_mps(query: EventQuery) -> float:
+    return max(SLOWED * query.robot_v_mps, _CREEPS_MPS)
 
 
 def _beside_m(event: Event, line_m: float) -> float:

@@ -88,6 +88,34 @@ def test_who_drives_straight_on_at_whatever_speed_meets_somebody_of_every_event(
                 assert driven.between or driven.state.phase == "acting"
 
 
+def by_fits_and_starts(v_mps: float, late_s: float) -> Callable[[float], float]:
+    """The speed (m/s) of who stands for 0.8 s in every 2.4 s, and takes 0.4 s to start and to stop."""
+
+    def speed_at(t_s: float) -> float:
+        since_s = (t_s + late_s) % 2.4
+        return v_mps * max(0.0, min(1.0, since_s / 0.4, 1.0 - (since_s - 1.2) / 0.4))
+
+    return speed_at
+
+
+@pytest.mark.parametrize("v_mps", [0.8, 1.2, 1.8])
+@pytest.mark.parametrize("kind", ["lateral", "overtaking"])
+def test_who_drives_by_fits_and_starts_meets_those_who_cross_or_cut_in(kind: str, v_mps: float) -> None:
+    """Whenever it happens to stand: they slow down as it does, and stand as it stands."""
+    for side, late_s in itertools.product((-1, 1), (0.0, 0.6, 1.2, 1.8)):
+        driven = drive(event(kind, side=side), by_fits_and_starts(v_mps, late_s), 44.0, 60.0)
+        assert driven.gap_m < 0.0, f"from {side}, {late_s} s late: {driven.gap_m} m"
+
+
+@pytest.mark.parametrize("kind", ["lateral", "overtaking"])
+def test_who_stops_before_one_who_crosses_or_cuts_in_has_let_it_go(kind: str) -> None:
+    """However late it stops, if it stands until they have gone on: it is not touched, and the event is over."""
+    meets_s = len(drive(event(kind), lambda _: 1.0, 44.0, 30.0).seen) * TICK_S
+    for early_s in (0.6, 1.0, 1.5, 2.5):
+        driven = drive(event(kind), lambda t_s, at_s=meets_s - early_s: float(t_s < at_s), 44.0, 40.0)  # type: ignore[misc]
+        assert driven.gap_m > 0.0 and driven.state.phase in ("over", "gone"), f"{early_s} s before"
+
+
 @pytest.mark.parametrize("left_m", [-0.9, -0.5, 0.5, 0.9])
 @pytest.mark.parametrize("kind", STANDING)
 def test_who_keeps_to_one_side_of_the_sidewalk_meets_those_who_stand_too(kind: str, left_m: float) -> None:

@@ -16,6 +16,9 @@ from tests.conftest import Cosim
 KINDS = tuple(EVENT_KINDS)
 NAMES = tuple(name for name in cheats.CHEATS if name != "Quitter")
 
+HARDEST = {"StopAndGo": ("lateral", "overtaking")}
+"""Who crosses or cuts in lets the robot go by its speed, so it is there that stops by the clock could pay."""
+
 
 def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
     """The first shipped ones of these events."""
@@ -28,7 +31,7 @@ def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
 def test_a_cheat_solves_no_event(name: str, request: pytest.FixtureRequest) -> None:
     """On two kinds of event each, on all of them with --whole: no success, and none is left out of the table."""
     whole, number = request.config.getoption("--whole"), NAMES.index(name)
-    kinds = KINDS if whole else (KINDS[number % 8], KINDS[(number + 3) % 8])
+    kinds = KINDS if whole else HARDEST.get(name, (KINDS[number % 8], KINDS[(number + 3) % 8]))
     table = cosim.run("reactive", getattr(cheats, name)(), scenarios=scenarios_of(kinds, 3 if whole else 1))
     assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0
 
