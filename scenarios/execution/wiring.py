@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +29,7 @@ from cosim.spec.event_kind import EventKinds
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, Robot, robot_called
-from cosim.spec.scenario import Barrier, Scenario, event_faults
+from cosim.spec.scenario import Barrier, CrowdSpec, Scenario, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.street.furniture import Prop, footprints
@@ -152,16 +153,31 @@ def crowd_of(scenario: Scenario, before: Entrances | None = None) -> SumoCrowd |
     robot, start_xy = robot_called(scenario.robot), scenario.start[:2]
     if goes_by_itself(street_map, scenario.crowd, before):
         return EmptyStreet(street_map, scenario.seed, start_xy)
-    try:
-        from sumo_nets.crowd.crowd import SumoCrowd  # with SUMO
-    except (ImportError, OSError) as error:
-        raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
-
     closed = frozenset(Port(barrier.strip, barrier.end) for barrier in scenario.barriers)
-    return SumoCrowd(
+    return sumo_crowd(
         net_path, street_map, scenario.crowd, scenario.seed, closed, start_xy, robot.footprint_m, before,
         standing_in(scenario, street_map),
     )  # fmt: skip
+
+
+def sumo_crowd(
+    net_path: Path,
+    street_map: StreetMap,
+    spec: CrowdSpec,
+    seed: int,
+    closed: frozenset[Port],
+    start_xy: tuple[float, float],
+    footprint_m: tuple[float, float] = COURIER.footprint_m,
+    before: Entrances | None = None,
+    standing: Standing | None = None,
+) -> SumoCrowd:
+    """The street life of any net, not running yet, by SUMO. Raises MachineError if it cannot be loaded."""
+    try:
+        from sumo_nets.crowd.crowd import SumoCrowd
+    except (ImportError, OSError) as error:
+        raise MachineError(f"SUMO cannot be loaded: {error}. `cosim doctor` says more") from error
+
+    return SumoCrowd(net_path, street_map, spec, seed, closed, start_xy, footprint_m, before, standing)
 
 
 def standing_in(scenario: Scenario, street_map: StreetMap) -> Standing:

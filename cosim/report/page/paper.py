@@ -13,6 +13,11 @@ Row = tuple[float | None, ...]
 
 _NO: Final = None
 
+EVENT_COLUMNS: Final = (
+    "static", "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing",
+)  # fmt: skip
+"""Of its pedestrian-reactive tables, in its order."""
+
 UNIT_OF_PAPER: Final[Mapping[str, Row]] = {
     "ViNT": (
         0.00, 0.00, 0.21, 0.00, 0.00, 0.21, 0.00, 0.00, 0.44,

@@ -13,16 +13,10 @@ from cosim.core.geometry import Floats
 from cosim.core.telling import Tell, untold
 from cosim.records.record import Record, Recorder
 from cosim.records.results import interval_of
+from cosim.report.page.paper import EVENT_COLUMNS
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import KINDS_OF_LIGHT, PaperTable, ReportedRun, table_of_paper
-from cosim.report.page.three_tables import (
-    EVENT_COLUMNS,
-    UNIT_COLUMNS,
-    MeanOfEpisodes,
-    cell_of,
-    episodes_of,
-    kind_in_words,
-)
+from cosim.report.page.three_tables import UNIT_COLUMNS, MeanOfEpisodes, cell_of, episodes_of, kind_in_words
 
 RUN_COLOURS: Final = ("#1f5fa8", "#d9722b", "#3b8f5a", "#8a5aa8", "#b03a48", "#5b6770", "#b8912f", "#2a9d9d")
 CAUSE_COLOURS: Final = dict(

@@ -11,13 +11,10 @@ import numpy as np
 import pandas as pd
 
 from cosim.records.results import not_to_be_quoted, summary_of
-from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER, Row
+from cosim.report.page.paper import EVENT_COLUMNS, LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER, Row
 from cosim.report.page.runs import OF_THE_PAPER, PaperTable, ReportedRun
 
 UNIT_COLUMNS: Final = ("straight", "curve", "crosswalk")
-EVENT_COLUMNS: Final = (
-    "static", "obstructing", "conversing", "queueing", "frontal", "lateral", "overtaking", "ped_crossing", "gesturing",
-)  # fmt: skip
 _SHARES: Final = {"success": "SR", "spl": "SPL", "route_completion": "RC"}
 RATES: Final = {
     "failures_per_100m": "FC", "collisions_per_100m": "C", "out_of_lane_per_100m": "OL", "freezings_per_100m": "F",
@@ -100,7 +97,7 @@ def episodes_of(runs: Iterable[ReportedRun], family: PaperTable) -> dict[str, pd
 
 def kind_in_words(kind: str) -> str:
     """As a head of a column."""
-    return {"ped_crossing": "ped. crossing"}.get(kind, kind)
+    return kind.replace("ped_", "ped. ")
 
 
 def _unit(runs: Sequence[ReportedRun]) -> str:

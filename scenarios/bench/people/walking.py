@@ -19,7 +19,7 @@ from cosim.spec.events import EventReply
 from cosim.spec.scenario import CrowdSpec
 from scenarios.bench.people.measures import FRAMES_HZ
 from scenarios.bench.people.streets import SIDEWALK_WIDTH_M, BlockRing, OpenCrosswalk
-from sumo_nets.crowd.crowd import SumoCrowd
+from scenarios.execution.wiring import sumo_crowd
 from sumo_nets.crowd.demand import VEHICLE_TYPES
 from sumo_nets.crowd.demand_log import Entrances, PersonEntry, VehicleEntry
 from sumo_nets.crowd.empty_street import TICK_MS, start_of
@@ -111,7 +111,7 @@ def _streets(
     """A street, tick after tick, without a robot; who comes and goes stands in `entrances`."""
     robot = RobotState(Pose(*at, 0.0))
     spec = CrowdSpec(persons=1, vehicles=0, radius_m=_RADIUS_M)
-    with SumoCrowd(net, street_map, spec, seed, frozenset(), at, before=entrances) as crowd:
+    with sumo_crowd(net, street_map, spec, seed, frozenset(), at, before=entrances) as crowd:
         for _ in range(round(seconds * 1000 / TICK_MS)):
             nobody = EventReply(episode="people", tick=crowd.street.tick, states=(), actors=())
             yield crowd.step(robot, nobody, absent=True)
