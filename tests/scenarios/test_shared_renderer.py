@@ -342,9 +342,10 @@ def test_episodes_whose_renderer_is_killed_are_run_again(
             os.kill(killed[0], signal.SIGKILL)
 
     monkeypatch.setattr(suite_run, "SharedRenderer", Noted)
-    monkeypatch.setattr(suite_run, "_untold", kill)
     folder = tmp_path / "run"
-    suite_run.run(suite_of("a", "b"), f"{OF}:Seeing", jobs=2, shared_renderer=True, out=folder, options=FRAMES)
+    suite_run.run(
+        suite_of("a", "b"), f"{OF}:Seeing", jobs=2, shared_renderer=True, out=folder, options=FRAMES, tell=kill
+    )
     assert killed and same(by_themselves, folder)
     logs = sorted(path.name for path in (folder / "logs").iterdir())
     assert logs == ["renderer-0.log", "renderer-1.log", "worker-0.log", "worker-1.log"]
