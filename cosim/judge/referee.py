@@ -55,8 +55,10 @@ FREE_OF_OBSTACLES_M = 0.1
 _SAME_PLACE_M = 10.0
 SAME_PLACE_FAILURES = 3
 _BEYOND_M = 1.0
-_BETWEEN_M = 0.5
-"""Where no waypoint beyond is free, as before the goal, places so far apart are tried."""
+_BETWEEN_M = 0.1
+_OFF_GOAL_M = 0.2
+"""Where no waypoint beyond is free, as before the goal, places so far apart are tried, up to so far from the goal's
+circle."""
 RED_WAIT_M = 4.0
 """A robot this close before a red crossing of its route waits lawfully."""
 STOP_S = 2.0
@@ -243,9 +245,8 @@ class Referee:
         if stuck:
             self._failed_at_s.clear()
             begin_m = max(recent) + _BEYOND_M
-            order = np.concatenate(
-                [waypoints[waypoints > begin_m], self._clear(np.arange(begin_m, last_m, _BETWEEN_M))]
-            )
+            end_m = self._route.length_m - self._scenario.goal_radius_m - _OFF_GOAL_M
+            order = np.concatenate([waypoints[waypoints > begin_m], self._clear(np.arange(begin_m, end_m, _BETWEEN_M))])
         else:
             order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
         for s_m in order:

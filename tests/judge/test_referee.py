@@ -252,10 +252,11 @@ def test_a_reset_keeps_off_obstacles() -> None:
 
 def test_who_hits_what_stands_before_the_goal_is_put_between_it_and_the_goal() -> None:
     """Beyond the last waypoint there is room still: else it would be put before the same bin until the time is up."""
-    one = referee(obstacles=(Obstacle(kind="bin", x_m=96.0, y_m=0.0, heading_rad=0.0),))
-    hit = [touch("bin", "object")]
-    at = [one.judge(step(60 * t, 95.3, contacts=hit)).reset for t in range(3)]
-    assert [reset.route_s_m for reset in at if reset is not None] == [95.0, 95.0, 96.8]
+    for bin_m, beyond_m in ((96.0, 96.8), (97.4, 98.2)):
+        one = referee(obstacles=(Obstacle(kind="bin", x_m=bin_m, y_m=0.0, heading_rad=0.0),))
+        hit = [touch("bin", "object")]
+        at = [one.judge(step(60 * t, bin_m - 0.7, contacts=hit)).reset for t in range(3)]
+        assert [reset.route_s_m for reset in at if reset is not None] == pytest.approx([95.0, 95.0, beyond_m], abs=0.11)
 
 
 def test_a_reset_goes_to_the_nearest_free_waypoint() -> None:
