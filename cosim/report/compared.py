@@ -83,7 +83,8 @@ def how_to_read(told: RunComparison) -> str:
     return (
         f"Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, {BOOTSTRAP} times, always "
         "the same. Within noise: the interval holds 0. Too few: it does not, but fewer than "
-        f"{FEWEST_CHANGED} scenarios changed. One interval in twenty misses by chance alone: there are {shown}. "
+        f"{FEWEST_CHANGED} scenarios changed (of a rate: of those with a failure). "
+        f"One interval in twenty misses by chance alone: there are {shown}. "
         "SR success, RC share of the route done, FC failures per 100 m travelled; the scenarios of an event are those "
         "that have one on their way."
     )

@@ -66,6 +66,19 @@ def test_fewer_than_six_scenarios_that_changed_are_too_few() -> None:
     assert flips(1000, 6, 0).verdict(True) == "better" and flips(1000, 0, 6).verdict(True) == "worse"
 
 
+def test_of_a_rate_the_scenarios_with_a_failure_are_counted() -> None:
+    """Five of a hundred ways had a failure, and each is some millimetres longer in the other run: too few, as of the
+    failures themselves. Six are enough."""
+    metres = np.full(100, 15.0), np.linspace(15.001, 15.1, 100)
+    for failures, verdict in ((5, "too few"), (6, "better")):
+        counted = (np.arange(100) < failures).astype(float)
+        found = difference_of_rates((counted, metres[0]), (np.zeros(100), metres[1]))
+        assert found.high < 0.0 and (found.changed, found.verdict(False)) == (failures, verdict)
+        assert difference_of_means(counted, np.zeros(100)).verdict(False) == verdict
+    none = difference_of_rates((np.zeros(1), metres[0][:1]), (np.zeros(1), metres[1][:1]))
+    assert (none.low, none.high, none.verdict(False)) == (0.0, 0.0, "within noise")
+
+
 @pytest.mark.parametrize(
     ("won", "lost", "verdict"),
     [(0, 24, "worse"), (24, 0, "better"), (28, 52, "worse"), (52, 28, "better"), (68, 92, "within noise")],

@@ -136,6 +136,38 @@ def test_a_failure_counts_where_so_many_people_were_near() -> None:
     assert exposure_of(record, log.travelled_m, near, (1.0, 3.0), moving=True).failures.tolist() == [0.0, 1.0, 0.0]
 
 
+def test_no_rate_is_of_the_metres_of_invalid_episodes(tmp_path: Path) -> None:
+    """An invalid episode has a trajectory to its goal, which plots do not read."""
+    (run,) = read_runs([run_of(tmp_path / "run", [HIT, "goal", "goal"], "mine")])
+    records = {
+        n: msgspec.structs.replace(r, status="invalid") if n == "s-001" else r for n, r in run.whole.records.items()
+    }
+    told = ReportedRun("mine", run.whole._replace(records=records))
+    assert [record.scenario for record, _ in told.tracks()] == ["s-000", "s-002"]
+
+
+def test_a_run_without_a_failure_stands_at_0_beside_one_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """39 ticks of 0.1 m began quick, the last with the failure, 41 slow; both runs have both points; the clean one
+    alone has no plot."""
+    runs = read_runs([run_of(tmp_path / how, [how] * 8, how) for how in (HIT, "goal")])
+    speed, nobody = np.repeat([[0.5, 0.0], [1.0, 0.0]], 40, axis=0), np.zeros(0, dtype=int)
+    track = {"pose": np.zeros((80, 3)), "speed": speed, "travelled_m": np.full(80, 0.1), "people_tick": nobody}
+    tracks = track | {"people_xy": np.zeros((0, 2))}
+    monkeypatch.setattr(ReportedRun, "tracks", lambda run: [(record, tracks) for record in run.records])
+    (plot,) = [plot for plot in plots_of(runs, colours_of(runs)) if "speed" in plot.title]
+    assert {trace["name"]: trace["x"] for trace in plot.figure["data"]} == {HIT: [0.0, 25.641], "goal": [0.0, 0.0]}
+    assert not [plot for plot in plots_of(runs[1:], colours_of(runs)) if "speed" in plot.title]
+
+
+def test_the_table_of_places_counts_failures_that_the_map_has_no_room_for(tmp_path: Path) -> None:
+    """Three failures of which the map shows one are three."""
+    text = page(
+        run_of(tmp_path / "run", [HIT] * 3 + ["goal"]),
+        maps=Maps([], {"city 0": [Spot(x_m=0.0, y_m=0.0, cause="obstacle", words="")]}, {"city 0": (4, 3)}),
+    )
+    assert '<td>4</td><td>3</td><td class="word">obstacle 3</td>' in text
+
+
 def test_names_and_reasons_cannot_break_out_of_the_page(tmp_path: Path) -> None:
     """A structure, a policy and a reason that are markup are seen as they are: no element comes of them."""
     plain, hostile = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
@@ -13,8 +13,8 @@ import numpy as np
 
 from cosim.core.telling import duration
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
-from cosim.report.page.reasons import CAUSES
-from cosim.report.page.runs import ReportedRun
+from cosim.report.page.reasons import CAUSES, mishaps_of
+from cosim.report.page.runs import ReportedRun, place_in_words
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import summary_html, tables_html, warnings_html, wide_html
 
@@ -51,7 +51,7 @@ def page_of(
         "results": ("Results", f"{warnings_html(runs)}{summary_html(runs, colours_of(runs))}{tables_html(runs)}"),
         "plots": ("Where it goes wrong", f'<div class="plots">{"".join(map(_plot, range(len(plots)), plots))}</div>'),
         "failures": ("Failures", _gallery(entries, note)),
-        "places": ("Places", _places(maps)),
+        "places": ("Places", _places(maps, _causes_of(runs))),
         "runs": ("What was run", _what_was_run(runs)),
     }
     if not entries and not note:
@@ -126,7 +126,8 @@ def _gallery(entries: Sequence[Entry], note: str) -> str:
     cards = "".join(_card(number, entry) for number, entry in enumerate(entries))
     intro = (
         f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, and every real place "
-        "that was driven. Open one to see its last seconds again: from above, by the robot's camera, from behind."
+        "that was driven, as far as there is room. Open one to see its last seconds again: from above, by the robot's "
+        "camera, from behind."
     )
     said = f'<p class="warn">{escape(note)}</p>' if note else ""
     return (
@@ -152,10 +153,10 @@ def _card(number: int, entry: Entry) -> str:
     return f'<li{attributes}><button class="card" type="button" data-entry="{number}">{picture}{about}</button></li>'
 
 
-def _places(maps: Maps) -> str:
+def _places(maps: Maps, causes: Mapping[str, Counter[str]]) -> str:
     drawn = {picture.place for picture in maps.pictures}
     options = "".join(
-        f'<option value="{k}">{escape(p.place)}: {len(maps.spots.get(p.place, ()))} failures</option>'
+        f'<option value="{k}">{escape(p.place)}: {causes[p.place].total()} failures</option>'
         for k, p in enumerate(maps.pictures)
     )
     drawing = '<div id="map" class="drawing" role="img" aria-label="Failures on the map"></div>'
@@ -167,8 +168,7 @@ def _places(maps: Maps) -> str:
     )
     rows = []
     for place, (episodes, failed) in maps.episodes.items():
-        causes = Counter(spot.cause for spot in maps.spots.get(place, ()))
-        told = ", ".join(f"{cause} {causes[cause]}" for cause in CAUSES if causes[cause])
+        told = ", ".join(f"{cause} {causes[place][cause]}" for cause in CAUSES if causes[place][cause])
         mark = "" if place in drawn else ' class="quiet"'
         rows.append(
             f'<tr{mark}><th scope="row">{escape(place)}</th><td>{episodes}</td><td>{failed}</td>'
@@ -240,6 +240,15 @@ def _lost(run: ReportedRun) -> str:
     lines = "".join(f"<li>{escape(line)}</li>" for line in [*told[:_MOST_TOLD], *more])
     title = f"{escape(run.label)}, {escape(run.spec.suite)}: without a result"
     return f'<div class="run"><h3>{title}</h3><ul>{lines}</ul></div>'
+
+
+def _causes_of(runs: Sequence[ReportedRun]) -> Mapping[str, Counter[str]]:
+    """How often each cause was, by place: of all failures, also of those that no map has room for."""
+    found: defaultdict[str, Counter[str]] = defaultdict(Counter)
+    for run in runs:
+        for name, record in run.whole.records.items():
+            found[place_in_words(run.scenarios[name])].update(mishap.cause for mishap in mishaps_of(record))
+    return found
 
 
 def counts_of(runs: Sequence[ReportedRun]) -> Mapping[str, tuple[int, int]]:

@@ -72,10 +72,11 @@ def plots_of(runs: Sequence[ReportedRun], colours: Mapping[str, str], tell: Tell
     speed: dict[str, dict[str, list[Exposure]]] = {"long ways": {}, "short ways": {}}
     for (label, family), parts in fast.items():
         speed["long ways" if family == "long" else "short ways"].setdefault(label, []).extend(parts)
-    note = "Pooled: the failures that happened so, on the metres that were driven so; bars are 95 % intervals."
+    note = "Pooled over episodes that ended: failures that happened so, on metres driven so; bars are 95 % intervals."
+    moving = f"{note} Without freezings, which happen at no speed."
     found.append(_exposed(people, colours, _NEAR_WORDS, f"{rate} by people within {NEAR_M:g} m, long ways", note))
     for words, of in speed.items():
-        found.append(_exposed(of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", note))
+        found.append(_exposed(of, colours, _SPEED_WORDS, f"{rate} by the robot's speed, m/s, {words}", moving))
     return [plot for plot in found if plot is not None]
 
 
@@ -123,11 +124,12 @@ def _exposures(runs: Sequence[ReportedRun], tell: Tell) -> tuple[_ByRun, _ByRun]
 def _exposed(
     of: Mapping[str, list[Exposure]], colours: Mapping[str, str], words: Sequence[str], title: str, note: str
 ) -> Plot | None:
+    """Of all runs, or of none where none has a failure."""
+    if not any(part.failures.any() for parts in of.values() for part in parts):
+        return None
     cells: dict[str, list[MeanOfEpisodes]] = {}
     for label, parts in of.items():
         failures, metres = np.array([p.failures for p in parts]), np.array([p.metres for p in parts])
-        if not failures.any():
-            continue
         cells[label] = [
             MeanOfEpisodes(100.0 * f.sum() / m.sum(), *interval_of(100.0 * f, m), int((m > 0).sum()))
             if m.sum() >= _LEAST_M
@@ -255,5 +257,5 @@ def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
     }
     if not any(rows.values()):
         return None
-    note = "Failures per 100 m travelled, all metres together. After a failure the robot is put back and goes on."
+    note = "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put back and goes on."
     return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

@@ -84,11 +84,12 @@ class ReportedRun:
             raise RunError(f"{error}: {anew(file)}") from error
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
-        """_COLUMNS of the log of each episode that has a trajectory. Raises RunError for a damaged one."""
+        """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does not count. Raises
+        RunError for a damaged one."""
         for record in self.records:
             file = record_file(self.path, record.scenario)
             path = file.with_name("trajectory.npz")
-            if record.ended is None or not path.exists():
+            if record.status != "done" or not path.exists():
                 continue
             try:
                 with np.load(path, allow_pickle=False) as arrays:
