@@ -136,8 +136,12 @@ def _latency_in_words(table: pd.DataFrame) -> str:
     """How late commands took effect, where they did."""
     if "latency_ms" not in table or not (table["latency_ms"].any() or table["real_time"].any()):
         return ""
-    least, middle, most = (f"{table['latency_ms'].quantile(q):g}" for q in (0.0, 0.5, 1.0))
-    if not table["real_time"].any():
+    measured = table["real_time"].any()
+    late_ms = table.loc[table["ended"].notna(), "latency_ms"] if measured else table["latency_ms"]
+    if not len(late_ms):
+        return "in real time: no episode came to its end, so no latency was measured"
+    least, middle, most = (f"{late_ms.quantile(q):g}" for q in (0.0, 0.5, 1.0))
+    if not measured:
         return f"latency {middle} ms: commands take effect so much later than what they answer"
     told = f"latency of an episode's answers {middle} ms ({least} to {most} ms)"
     return f"in real time: {told}, as measured here; not to be had again from the seed, only replayed"

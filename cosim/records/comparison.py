@@ -15,6 +15,7 @@ from cosim.core.geometry import Floats
 from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
 from cosim.records.paired import PairedDifference, difference_of_means, difference_of_rates
 from cosim.records.results import not_to_be_quoted, table_of
+from cosim.records.run_folder import RunSpec
 from cosim.records.whole_run import WholeRun, read_whole_run
 from cosim.spec.scenario import Scenario
 
@@ -168,9 +169,16 @@ def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[st
         if crashed:
             yield f"{one.label}: {crashed} crashed, counted as the worst there is; groups with them have no rates"
         first = runs[0].spec
+        if (theirs := _asked(first)) != (mine := _asked(run.spec)):
+            yield f"{told[0].label} was asked for {theirs}, {one.label} for {mine}"
         if changed := [n for n, v in first.versions.items() if run.spec.versions.get(n) != v]:
             apart = ", ".join(f"{n} {first.versions[n]} and {run.spec.versions.get(n)}" for n in changed)
             yield f"{told[0].label} and {one.label} ran with other versions, a difference may be theirs: {apart}"
+
+
+def _asked(spec: RunSpec) -> str:
+    """What makes a run harder or easier, whatever its policy is."""
+    return f"goal {spec.goal_protocol}, {'real time' if spec.real_time else f'latency {spec.latency_ms:g} ms'}"
 
 
 def _lonely(pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Iterator[str]:

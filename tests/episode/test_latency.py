@@ -74,7 +74,8 @@ def test_real_time_goes_with_one_process_and_no_latency() -> None:
 
 
 def test_tables_tell_of_latency_where_there_is_any() -> None:
-    """A given one as a number, a measured one with its range and what it is not; of none nothing."""
+    """A given one as a number, a measured one with its range, of the episodes that ended, and what it is not; of none
+    nothing."""
 
     def told(*records: Record) -> str:
         out, said = terminal()
@@ -83,10 +84,12 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
 
     none = begun(load_suite("reactive").scenarios[0], Manifest("m", camera=None), "h")
     given = msgspec.structs.replace(none, latency_ms=200.0)
-    real = [msgspec.structs.replace(none, latency_ms=ms, real_time=True) for ms in (100.0, 150.0, 400.0)]
+    crashed = msgspec.structs.replace(none, real_time=True)
+    real = [msgspec.structs.replace(crashed, latency_ms=ms, ended="goal") for ms in (100.0, 150.0, 400.0)]
     assert "latency" not in told(none)
     assert "latency 200 ms: commands take effect so much later" in told(given)
-    assert "in real time: latency of an episode's answers 150 ms (100 to 400 ms)" in told(*real)
+    assert "in real time: latency of an episode's answers 150 ms (100 to 400 ms)" in told(*real, crashed, crashed)
+    assert "no episode came to its end" in told(crashed)
     assert "not to be had again from the seed" in told(*real)
 
 

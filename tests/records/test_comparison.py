@@ -6,11 +6,13 @@ import io
 import json
 import os
 import re
+import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
+import msgspec
 import pandas as pd
 import pytest
 from rich.console import Console
@@ -109,6 +111,16 @@ def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
     said = cosim("compare", str(runs / "a"), str(runs / "a"))
     assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
     assert "solved by a (2) alone, 0: none" in said.stdout
+
+
+def test_runs_of_other_latency_or_goal_are_told(runs: Path, tmp_path: Path) -> None:
+    """Both stand in a note, of the run that was asked for others."""
+    late = tmp_path / "late"
+    shutil.copytree(runs / "b", late)
+    spec = msgspec.structs.replace(read_spec(late), latency_ms=200.0, goal_protocol="route_point")
+    (late / "run.json").write_bytes(msgspec.json.encode(spec))
+    told = compare_runs([runs / "a", late])
+    assert told.notes == ("a was asked for goal none, latency 0 ms, b for goal route_point, latency 200 ms",)
 
 
 def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
