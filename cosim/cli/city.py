@@ -15,7 +15,7 @@ from rich.table import Column, Table
 
 from cosim.cli.consoles import err, out
 from cosim.cli.progress import doing
-from cosim.core.box import box_of
+from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import SOME_CRASHED
 
 if TYPE_CHECKING:
@@ -122,6 +122,7 @@ def draw_city(
     city = City(seed=seed, size_m=size, style=style)
     with doing(f"building {city.name}") as tell:
         street_map = street_map_of(city_net(city))
+        refuse_outside("--zoom", part, street_map.bounds)
         tell("drawing")
         write_png(_picture(street_map, part), picture)
     out.print(f"Picture: {picture}", soft_wrap=True)

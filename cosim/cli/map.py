@@ -14,7 +14,7 @@ from rich.table import Table
 
 from cosim.cli.consoles import out
 from cosim.cli.progress import doing
-from cosim.core.box import box_of
+from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 
 if TYPE_CHECKING:
@@ -81,6 +81,8 @@ def report_map_check(
         if picture is not None:
             from cosim.report.mapsheet import draw_map, write_png
 
+            if part is not None:
+                refuse_outside("--zoom", part, street_map.bounds)
             tell("drawing")
             write_png(draw_map(street_map, found, part), picture)
     if as_json:

@@ -16,7 +16,7 @@ from cosim.cli.board import Board
 from cosim.cli.consoles import err, out
 from cosim.cli.eyes import CAMERA_HELP, Choice, camera_here
 from cosim.cli.progress import doing
-from cosim.core.box import box_of
+from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import (
     INTERRUPTED,
     SOME_CRASHED,
@@ -151,6 +151,8 @@ def draw_own(
             faults = "\n  ".join(made.faults)
             raise SpecError(f"{file}: {faults}\n  --whole draws the place alone, to find a way on it")
         _, street_map = place(place_of_own(variant.own.place) if made.scenario is None else made.scenario.place)
+        if part is not None:
+            refuse_outside("--zoom", part, street_map.bounds)
         write_png(draw_plan(street_map, made.scenario, whole=whole, part=part), picture)
     for fault in made.faults:
         err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)

@@ -16,3 +16,11 @@ def box_of(option: str, words: str, sides: str = "west,south,east,north") -> _Bo
     if not (x0 < x1 and y0 < y1):
         raise UsageError(f"{option} is {sides}: '{words}' is empty")
     return x0, y0, x1, y1
+
+
+def refuse_outside(option: str, part: _Box, bounds: _Box) -> None:
+    """Raises UsageError, with the bounds of the place, when a part of it holds nothing of it."""
+    (x0, y0, x1, y1), (west, south, east, north) = part, bounds
+    if x1 <= west or x0 >= east or y1 <= south or y0 >= north:
+        ends = ",".join(f"{end:.0f}" for end in bounds)
+        raise UsageError(f"{option} shows nothing of the place, which reaches over {ends}: give a part of that")

@@ -266,7 +266,8 @@ def read_spec(path: Path) -> RunSpec:
         beside = [p.parent.name for p in path.parent.glob("*/run.json")] if path.parent.is_dir() else []
         raise unknown("run", str(path), beside) from None
     except (OSError, msgspec.DecodeError) as error:
-        raise RunError(f"{path / 'run.json'}: {error}") from error
+        why = error.strerror if isinstance(error, OSError) else error
+        raise RunError(f"{path / 'run.json'}: cannot be read: {why}: name another run, or run it again") from error
 
 
 def read_records(path: Path) -> list[Record]:

@@ -30,8 +30,8 @@ def read_whole_run(path: Path) -> WholeRun:
     """The run in a folder.
 
     Raises UsageError where there is none; RunError, naming file and remedy, while it is going on, before an episode has
-    ended, for a record that is truncated or not what `results.sqlite` has, for scenarios that were edited since, and
-    for measures of another metric schema; SpecError for a damaged `scenarios.json`.
+    ended, for a record that is gone, truncated or not what `results.sqlite` has, for scenarios that were edited since,
+    and for measures of another metric schema; SpecError for a damaged `scenarios.json`.
     """
     spec = read_spec(path)
     refuse_in_use(path)
@@ -47,7 +47,10 @@ def read_whole_run(path: Path) -> WholeRun:
                 "the file back as it was, or run it again into another --out"
             )
         file = record_file(path, name)
-        if file.exists() and (apart := _apart(_read(file), record)):
+        if not file.exists():
+            if record.ended is not None:
+                raise RunError(f"{file}: not there: {anew(file)}")
+        elif apart := _apart(_read(file), record):
             raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
     return WholeRun(path, spec, scenarios, records)
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import shapely
 
-from cosim.core.errors import unwritable
+from cosim.core.errors import UsageError, unwritable
 from cosim.core.whole_file import write_whole
 from cosim.place.map_check import MapCheck
 from cosim.place.street_map import StreetMap, Strip
@@ -53,7 +53,9 @@ def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, f
 
 
 def write_png(image: Image, path: Path) -> None:
-    """Write an RGB picture. Raises MachineError when the folder cannot be written."""
+    """Write an RGB picture. Raises UsageError for a name that is no PNG's, MachineError where it cannot be written."""
+    if path.suffix.lower() != ".png":
+        raise UsageError(f"{path}: cannot be written as a picture; use a name that ends in .png")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_whole(path, cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR))[1].tobytes())

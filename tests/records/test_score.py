@@ -207,9 +207,6 @@ def test_a_damaged_episode_is_refused_and_can_be_mended(tmp_path: Path, cosim: C
         file.write_bytes(file.read_bytes()[:200])
     else:
         file.unlink()
-    if (name, damage) == ("record.json", "gone"):
-        assert cosim("score", str(run)).returncode == 0
-        return
     told = refusal(cosim, run)
     database = run / "results.sqlite"
     assert f"error: {file}: not " in told and f"remove {file.parent} and {database}, and give the command" in told
@@ -219,6 +216,19 @@ def test_a_damaged_episode_is_refused_and_can_be_mended(tmp_path: Path, cosim: C
     database.unlink()
     with RunFolder.resume(run, read_spec(run)) as folder:
         assert folder.finished() == {"s-000", "s-002"}
+
+
+@pytest.mark.parametrize("damage", ["no run.json", "no folder"])
+def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim, damage: str) -> None:
+    """A run.json that cannot be read, or a file in place of the folder: one line, without the words of the system."""
+    run = tmp_path / "run"
+    if damage == "no folder":
+        run.touch()
+    else:
+        run.mkdir()
+        (run / "run.json").write_text("no JSON")
+    told = refusal(cosim, run)
+    assert f"error: {run / 'run.json'}: cannot be read: " in told and "name another run" in told and "Errno" not in told
 
 
 def test_a_record_that_is_not_what_the_database_has_is_refused(tmp_path: Path, cosim: Cosim) -> None:

@@ -238,6 +238,8 @@ def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cos
     for words in (("-o", "way.png"), ("--whole", "-o", "town.png"), ("--zoom", "0,0,90,60", "-o", "part.png")):
         done = cosim("scenario", "draw", "mine.toml", *words, cwd=tmp_path)
         assert done.returncode == 0 and (tmp_path / words[-1]).read_bytes().startswith(b"\x89PNG"), done.stderr
+    done = cosim("scenario", "draw", "mine.toml", "--zoom", "900,900,990,990", "-o", "far.png", cwd=tmp_path)
+    assert done.returncode == 2 and "shows nothing of the place" in done.stderr and not (tmp_path / "far.png").exists()
     text = (tmp_path / "mine.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("# time_s = 260", "time_s = 1"))
     done = cosim("scenario", "run", "mine.toml", "--policy", "straight", "--out", "run", cwd=tmp_path)

@@ -155,9 +155,11 @@ def test_city_commands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert shown.exit_code == 0 and "2 cities" in shown.output and "frontage" in shown.output
     drawn = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "c.png")])
     assert drawn.exit_code == 0 and (tmp_path / "c.png").read_bytes()[1:4] == b"PNG"
-    for zoom in ("1,2,3", "5,5,1,9"):
+    for zoom in ("1,2,3", "5,5,1,9", "900,900,990,990"):
         bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.png"), "--zoom", zoom])
         assert bad.exit_code != 0 and "--zoom" in str(bad.exception)
+    bad = runner.invoke(app, ["city", "draw", "3", "--size", "250", "-o", str(tmp_path / "d.gif")])
+    assert "use a name that ends in .png" in str(bad.exception) and not list(tmp_path.glob("d.*"))
     assert runner.invoke(app, ["city", "make", "--seed", "1", "--size", "9", str(tmp_path / "e")]).exit_code != 0
 
 
