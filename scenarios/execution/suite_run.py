@@ -155,8 +155,10 @@ def measured_latency_ms(whole: Suite, first: Scenario, policy: str, options: Epi
         real_time=True,
     )  # fmt: skip
     row = run(whole, policy, scenarios=[first.id], options=alone).iloc[0]
-    if row["status"] == "crashed":
-        raise UsageError(f"the latency of '{policy}' cannot be measured in {first.id}: it crashed: {row['reason']}")
+    if not isinstance(row["ended"], str):
+        raise UsageError(
+            f"the latency of '{policy}' cannot be measured: {first.id} is {row['status']}: {row['reason']}"
+        )
     return float(row["latency_ms"])
 
 

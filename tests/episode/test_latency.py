@@ -8,6 +8,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
+import pandas as pd
 import pytest
 
 from cosim.cli.latency import with_latency
@@ -25,6 +26,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.catalog import load_suite
 from scenarios.checks import small_scenario
+from scenarios.execution import suite_run
 from scenarios.execution.replay import Recorded, replayed
 from scenarios.execution.run import run_episode
 from scenarios.execution.suite_run import check_alone
@@ -201,3 +203,15 @@ def test_a_measured_latency_is_that_of_every_command_of_the_run(
     assert cosim(*words, "--latency", "measured", "--resume", cwd=tmp_path).returncode == 0
     other = cosim(*words, "--resume", cwd=tmp_path)
     assert other.returncode == 2 and f"its latency_ms is {latency_ms}, now asked for is 0.0" in other.stderr
+
+
+@pytest.mark.parametrize(("status", "ended"), [("crashed", None), ("invalid", float("nan"))])
+def test_a_latency_is_not_taken_from_an_episode_that_did_not_end(
+    scenario: Scenario, monkeypatch: pytest.MonkeyPatch, status: str, ended: float | None
+) -> None:
+    """Whether the policy crashed or an engine failed: it is refused with the reason, and not 0 ms."""
+    row = {"status": status, "ended": ended, "reason": "no memory", "latency_ms": 0.0}
+    monkeypatch.setattr(suite_run, "run", lambda *_, **__: pd.DataFrame([row]))
+    suite = Suite(name="brief", version="1", scenarios=(scenario,))
+    with pytest.raises(UsageError, match=f"cannot be measured: {scenario.id} is {status}: no memory"):
+        suite_run.measured_latency_ms(suite, scenario, "mine", EpisodeOptions())
