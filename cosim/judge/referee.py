@@ -245,16 +245,25 @@ class Referee:
         if stuck:
             self._failed_at_s.clear()
             begin_m = max(recent) + _BEYOND_M
-            end_m = self._route.length_m - self._scenario.goal_radius_m - _OFF_GOAL_M
-            order = np.concatenate([waypoints[waypoints > begin_m], self._clear(np.arange(begin_m, end_m, _BETWEEN_M))])
+            order = waypoints[waypoints > begin_m]
         else:
             order = waypoints[np.argsort(np.abs(waypoints - failure.route_s_m), kind="stable")]
-        for s_m in order:
-            pose = self._route.at(float(s_m))
-            if self._free(pose, float(s_m), step):
-                return Reset(pose, float(s_m))
+        if (found := self._first_free(order, step)) is not None:
+            return found
+        if stuck:
+            end_m = self._route.length_m - self._scenario.goal_radius_m - _OFF_GOAL_M
+            if (found := self._first_free(self._clear(np.arange(begin_m, end_m, _BETWEEN_M)), step)) is not None:
+                return found
         s_m = float(waypoints[np.argmin(np.abs(waypoints - failure.route_s_m))])
         return Reset(self._route.at(s_m), s_m)
+
+    def _first_free(self, places: Floats, step: Step) -> Reset | None:
+        """At the first of these arc lengths, metres, at which nobody and nothing is in the way."""
+        for s_m in places.tolist():
+            pose = self._route.at(s_m)
+            if self._free(pose, s_m, step):
+                return Reset(pose, s_m)
+        return None
 
     def _clear(self, waypoints: Floats) -> Floats:
         """Those at which the robot can turn on the spot between the obstacles."""
