@@ -163,26 +163,24 @@ class _Reel:
         kinds: dict[tuple[str, int], tuple[str, tuple[int, int]]] = {}
         doing: dict[tuple[str, int], list[tuple[int, str]]] = {}
         last: dict[str, int] = {}
+
+        def came(sample: int, name: str, at: tuple[float, float, float]) -> tuple[str, int]:
+            if last.get(name) != sample - 1:
+                begun[name] = sample
+            last[name] = sample
+            rows.setdefault((name, begun[name]), []).append(at)
+            return name, begun[name]
+
         for sample, (street, robot) in enumerate(zip(self._streets, track, strict=True)):
             people, vehicles = street.people, street.vehicles
             for i in np.flatnonzero(np.hypot(*(people.xy - robot[:2]).T) < _PEOPLE_M).tolist():
-                name = people.ids[i]
-                if last.get(name) != sample - 1:
-                    begun[name] = sample
-                last[name] = sample
-                key = name, begun[name]
-                rows.setdefault(key, []).append((*people.xy[i], people.heading[i]))
+                key = came(sample, people.ids[i], (*people.xy[i], people.heading[i]))
                 kinds[key] = PersonKind(people.kind[i]).name.lower(), (60, 60)
                 said = doing.setdefault(key, [])
                 if not said or said[-1][1] != people.doing[i]:
                     said.append((sample, people.doing[i]))
             for i in np.flatnonzero(np.hypot(*(vehicles.xy - robot[:2]).T) < _VEHICLES_M).tolist():
-                name = vehicles.ids[i]
-                if last.get(name) != sample - 1:
-                    begun[name] = sample
-                last[name] = sample
-                key = name, begun[name]
-                rows.setdefault(key, []).append((*vehicles.xy[i], vehicles.heading[i]))
+                key = came(sample, vehicles.ids[i], (*vehicles.xy[i], vehicles.heading[i]))
                 kinds[key] = "vehicle", (round(100.0 * vehicles.size[i, 0]), round(100.0 * vehicles.size[i, 1]))
         tracks, names = [], []
         for (name, first), at in rows.items():
