@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from cosim.cli.live import LONGEST_WAIT_S
+from cosim.cli.options.endpoint import LONGEST_WAIT_S
 from cosim.episode.control import Command
 from cosim.episode.ports import Manifest, Observation
 from cosim.place.walk_graph import WalkGraph

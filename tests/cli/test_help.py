@@ -14,7 +14,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli.app import app
-from cosim.cli.live import checked_endpoint
+from cosim.cli.options.endpoint import checked_endpoint
 from cosim.core.errors import UsageError
 from tests.conftest import PATIENCE_S
 

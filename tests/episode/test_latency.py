@@ -11,8 +11,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cosim.cli.latency import with_latency
-from cosim.cli.tables import print_terms
+from cosim.cli.options.latency import with_latency
+from cosim.cli.terminal.run_table import print_terms
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.core.state import STILL, Command
@@ -30,8 +30,8 @@ from scenarios.execution import suite_run
 from scenarios.execution.replay import Recorded, replayed
 from scenarios.execution.run import run_episode
 from scenarios.execution.suite_run import check_alone
+from tests.cli.terminal.test_run_table import terminal
 from tests.conftest import Cosim
-from tests.records.test_tables import terminal
 
 
 def commands(answers: Floats, ticks: int) -> Floats:

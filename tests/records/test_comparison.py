@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cosim.cli.compare import print_comparison
+from cosim.cli.results.compare import print_comparison
 from cosim.judge.metrics import METRICS
 from cosim.records.comparison import (
     ComparedRun,

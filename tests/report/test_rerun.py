@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import cosim as product
-from cosim.cli.eyes import check_rerun
+from cosim.cli.options.recording import check_rerun
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.state import LABELS
 from cosim.episode.log import Log

@@ -1,0 +1,17 @@
+"""The option that names a file to be written: refused before anything is made."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from cosim.core.errors import MachineError, UsageError
+
+PICTURES = (".png", ".jpg", ".jpeg")
+
+
+def check_output(path: Path, what: str = "a picture", endings: tuple[str, ...] = PICTURES) -> None:
+    """Before it is made: raises UsageError when no such file can have this name, MachineError without its folder."""
+    if path.suffix.lower() not in endings:
+        raise UsageError(f"{path}: cannot be written as {what}; use a name that ends in {' or '.join(endings[:2])}")
+    if not path.resolve().parent.is_dir():
+        raise MachineError(f"{path}: cannot be written: no folder {path.parent}")

@@ -1,0 +1,6 @@
+"""Under which heads `cosim --help` lists commands; those without one come first."""
+
+from __future__ import annotations
+
+LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
+TRUST = "Trust what came out"

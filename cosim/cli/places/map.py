@@ -1,0 +1,204 @@
+"""The command line of places: `cosim map import`, `check`, `endure`, `list`."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import msgspec
+import typer
+from rich import box
+from rich.markup import escape
+from rich.table import Table
+
+from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.progress import doing
+from cosim.core.box import box_of, refuse_outside
+from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
+
+if TYPE_CHECKING:
+    from cosim.place.map_check import MapCheck
+    from cosim.place.street_map import StreetMap
+    from sumo_nets.maps.mapstore import About
+
+map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Cities of the real world: SUMO and OSM.")
+
+
+@map_app.command(
+    "import",
+    epilog="Examples:  \n"
+    "`cosim map import berlin.osm.pbf --bbox 13.43,52.46,13.45,52.48`  \n"
+    "`cosim map import hamburg.net.xml.gz --upgrade`",
+)
+def import_(
+    file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
+    name: Annotated[str | None, typer.Option(help="Its name from now on; by default the file's.")] = None,
+    bbox: Annotated[
+        str | None, typer.Option(help="Keep this part: west,south,east,north in degrees (metres without projection).")
+    ] = None,
+    lefthand: Annotated[
+        bool | None, typer.Option("--lefthand/--righthand", help="Side people drive on; by default looked up.")
+    ] = None,
+    upgrade: Annotated[
+        bool, typer.Option("--upgrade", help="Give a net for cars alone sidewalks and crossings.")
+    ] = False,
+) -> None:
+    """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
+    from sumo_nets.maps.importer import Options
+    from sumo_nets.maps.mapstore import checked_map, import_map
+
+    options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
+    with doing(f"converting {file.name}") as tell:
+        about = import_map(file, name, options)
+        tell(f"checking {about.name}")
+        _, check, about = checked_map(about.name)
+    print_check(check, about)
+    out.print(f"Kept as '{about.name}': see it with `cosim map check {about.name} -o map.png`.", soft_wrap=True)
+    if not check.usable:
+        raise typer.Exit(WRONG_USE)
+
+
+@map_app.command(
+    "check",
+    epilog="Examples:  \n"
+    "`cosim map check hamburg -o hamburg.png`  \n"
+    "`cosim map check hamburg --zoom 900,700,1200,1000 -o junction.png`  \n"
+    "`cosim map check sumo-fkk-in --json`",
+)
+def report_map_check(
+    place: Annotated[str, typer.Argument(metavar="MAP", help="A map, a folder of a city or map, a .net.xml(.gz).")],
+    picture: Annotated[Path | None, typer.Option("-o", "--output", help="Write a picture of it, a PNG.")] = None,
+    zoom: Annotated[str | None, typer.Option(help="Part of it for the picture: x0,y0,x1,y1 in metres.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Everything found, as JSON.")] = False,
+) -> None:
+    """Say what a map is, what is wrong with it and what it can be used for. Exit code 1: it is not usable."""
+    part = None if zoom is None else box_of("--zoom", zoom)
+    if part is not None and picture is None:
+        raise UsageError("--zoom is for the picture: say where to write it with -o")
+    with doing(f"checking {place}") as tell:
+        street_map, found, about = _look_up(place)
+        if picture is not None:
+            from cosim.report.mapsheet import draw_map, write_png
+
+            if part is not None:
+                refuse_outside("--zoom", part, street_map.bounds)
+            tell("drawing")
+            write_png(draw_map(street_map, found, part), picture)
+    if as_json:
+        report = {"usable": found.usable, "check": found, "about": about}
+        typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
+    else:
+        print_check(found, about)
+        if picture is not None:
+            out.print(f"Picture: {picture}", soft_wrap=True)
+    if not found.usable:
+        raise typer.Exit(WRONG_USE)
+
+
+@map_app.command(
+    "endure",
+    epilog="Examples:  \n`cosim map endure sumo-drt`  \n`cosim map endure sumo-drt sumo-fkk-in --minutes 30 --seed 1`",
+)
+def endure_map(
+    maps: Annotated[list[str], typer.Argument(metavar="MAP...", help="Maps, folders of cities or maps, nets.")],
+    minutes: Annotated[float, typer.Option(min=0.1, help="Simulated minutes on each.")] = 10.0,
+    seed: Annotated[int, typer.Option(min=0, help="Of crowd, traffic and wanderings.")] = 0,
+) -> None:
+    """Simulate crowd and traffic around a robot that goes anywhere, a process for each map. Exit code 1: SUMO died."""
+    from cosim.core.clock import Clock
+    from scenarios.bench.soak import endure as endured_on
+    from sumo_nets.maps.place_names import place_called
+
+    places = [place_called(name) for name in maps]
+    table = Table("map", "simulated min", "persons", "vehicles", "wall s", "ended by", box=box.SIMPLE_HEAD)
+    failed = False
+    for name, where in zip(maps, places, strict=True):
+        with doing(f"{minutes:g} min on {name}") as tell:
+            done = endured_on(where, seed, minutes, partial(tell, f"{minutes:g} min on {name}"))
+        failed |= bool(done.reason)
+        simulated_min = Clock().time_s(done.ticks) / 60.0
+        cells = (f"{simulated_min:.1f}", f"{done.persons:.0f}", f"{done.vehicles:.0f}", f"{done.wall_s:.0f}")
+        table.add_row(name, *cells, escape(done.reason or "its time"))
+    out.print(table)
+    if failed:
+        raise typer.Exit(SOME_CRASHED)
+
+
+@map_app.command("list", epilog="Example:  \n`cosim map list`")
+def list_() -> None:
+    """List the maps: imported ones, and those that come with SUMO (imported when first used)."""
+    from sumo_nets.maps.mapstore import known_maps
+
+    table = Table("map", "origin", "file", box=box.SIMPLE_HEAD)
+    for known in known_maps().values():
+        table.add_row(known.name, known.origin, known.source)
+    out.print(table)
+
+
+def print_check(check: MapCheck, about: About | None) -> None:
+    """A check in words."""
+    width_m, height_m = check.size_m
+    table = Table(check.name, "", box=box.SIMPLE_HEAD)
+    for what, value in _rows(check):
+        table.add_row(what, value)
+    table.add_row("size", f"{width_m:.0f} x {height_m:.0f} m, traffic on the {'left' if check.left_hand else 'right'}")
+    out.print(table)
+    said = [("note", note) for note in check.notes]
+    if about is not None:
+        said += [("changed", change) for change in about.changes]
+        said += [("licence", licence) for licence in about.licences or ("none found: ask where the file comes from",)]
+    said += [("NOT USABLE", reason) for reason in check.reasons]
+    for head, words in said:
+        out.print(f"{head}: {words}", soft_wrap=True, markup=False, highlight=False)
+    out.print(f"unit scenarios {_yes(check.unit_possible)}, long-horizon scenarios {_yes(check.long_horizon_possible)}")
+
+
+def _rows(check: MapCheck) -> list[tuple[str, str]]:
+    islands = ", ".join(f"{island.share:.1%}" for island in check.islands[:5])
+    guessed = "unknown" if check.guessed_share is None else f"{check.guessed_share:.0%} of their length"
+    shown = ", ".join(f"{count} x {kind}" for kind, count in check.features.items())
+    return [
+        ("walkable", f"{check.walkable_km:.2f} km on {check.sidewalks} sidewalks, {check.corners} corners"),
+        ("crossings", f"{check.crossings}, {check.crossing_km:.2f} km; {check.signalised} with signals"),
+        ("roads", f"{check.roads_km:.1f} km of lanes"),
+        ("islands", f"{len(check.islands)}: {islands}{' ...' if len(check.islands) > 5 else ''}"),
+        (
+            "narrower than 1 m",
+            f"{check.narrow} sidewalks, {check.narrow_km:.2f} km; narrowest {check.narrowest_m:.2f} m",
+        ),
+        ("shorter than 1 m", f"{check.stubs} pieces; {check.dead_ends} dead ends"),
+        (
+            "on the road",
+            f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it; routes avoid them",
+        ),
+        ("over or under a road", f"{check.stacked} sidewalks, with no crossing there"),
+        ("guessed sidewalks", guessed),
+        ("shown by the map", shown or "no buildings, no things: all are made up"),
+    ]
+
+
+def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
+    """What is known of a place by whatever it is called; a net that was not imported is checked as it is."""
+    from cosim.place.map_check import check_map
+    from cosim.spec.scenario import CityMap
+    from sumo_nets.city.store import city_net
+    from sumo_nets.maps.mapstore import checked_map
+    from sumo_nets.maps.place_names import place_called
+    from sumo_nets.net.netfacts import read_facts
+    from sumo_nets.net.snapshot import street_map_of
+
+    path = Path(called)
+    if not path.is_file():
+        where = place_called(called)
+        if isinstance(where, CityMap):
+            return checked_map(where.map)
+        path = city_net(where)
+    elif not path.name.endswith((".net.xml", ".net.xml.gz", "net.xml")):
+        raise MapError(f"{path}: only SUMO nets can be checked as they are: import it first with `cosim map import`")
+    street_map = street_map_of(path)
+    return street_map, check_map(street_map, None, read_facts(path)), None
+
+
+def _yes(possible: bool) -> str:
+    return "possible" if possible else "NOT possible"

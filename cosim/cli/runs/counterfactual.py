@@ -1,0 +1,41 @@
+"""`cosim counterfactual`: an episode's street without the robot."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from cosim.cli.options.panels import LOOK
+from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.progress import doing
+
+counterfactual_app = typer.Typer()
+
+
+@counterfactual_app.command(
+    "counterfactual", rich_help_panel=LOOK, epilog="Example:  \n`cosim counterfactual runs/mine lh-011-00`"
+)
+def compare_one(
+    folder: Annotated[Path, typer.Argument(metavar="RUN", help="A run folder.")],
+    episode: Annotated[str, typer.Argument(help="One of its episodes.")],
+) -> None:
+    """Replay an episode, simulate its street again without the robot, and print whom the robot delayed by how much."""
+    from cosim.judge.delay import DELAY_NEAR_M
+    from scenarios.execution.replay import check, compared, recorded
+
+    with doing(f"reading {episode}") as tell:
+        told = recorded(folder, episode)
+        state_hash, found = compared(told, tell)
+    check(folder, told, state_hash)
+    table = Table(episode, "delay of\nthose near, s", "those\nnear", "delay of\nall, s", "all", "not\ncomparable")
+    for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
+        near, everybody = (f"{delay.near_s:+.1f}", str(delay.near)), (f"{delay.delay_s:+.1f}", str(delay.compared))
+        table.add_row(name, *near, *everybody, str(delay.unmatched))
+    out.print(table)
+    out.print(
+        f"delay: how much later than without the robot, summed; near: came within {DELAY_NEAR_M:g} m of it; far from "
+        "it the two streets differ by chance; not comparable: not the same in both"
+    )

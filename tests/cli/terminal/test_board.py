@@ -1,0 +1,99 @@
+"""The progress display of a run: what is left is judged by the way, and it fits a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import io
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from cosim.cli.terminal.board import SETUP_M, Board, Left
+from cosim.core.telling import duration
+from scenarios.catalog import load_suite
+from scenarios.execution.messages import Compares, Done, Progress
+
+LONG = load_suite("long-horizon").scenarios
+SHORT = load_suite("reactive").scenarios
+
+
+class Clock:
+    """Seconds, as the test says."""
+
+    now_s = 0.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
+    """After 100 m of 100 + 300 m in 40 s about 100 s are left, not 40; before anything is done nothing is said."""
+    left = Left({"a": 100.0, "b": 300.0})
+    assert left.seconds(3.0) is None
+    left.at("a", 1.0)
+    assert left.seconds(40.0) == pytest.approx(40.0 * (300.0 + SETUP_M) / (100.0 + SETUP_M))
+    left.at("b", 0.5)
+    assert left.seconds(100.0) == pytest.approx(100.0 * 150.0 / (100.0 + SETUP_M + 150.0 + SETUP_M))
+    left.at("b", 1.0)
+    assert left.seconds(200.0) == 0.0
+
+
+def board_of(scenarios: tuple, done: tuple[str, ...] = (), **options: object) -> tuple[Board, Clock, io.StringIO]:
+    clock, said = Clock(), io.StringIO()
+    console = Console(file=said, width=80)
+    return Board(scenarios, set(done), console=console, clock=clock, **options), clock, said  # type: ignore[arg-type]
+
+
+def test_a_log_says_how_many_are_done_and_how_long_the_rest_takes() -> None:
+    """A line for each episode that ends: its status, how many of how many, about how long it still takes."""
+    board, clock, said = board_of(LONG[:3], done=(LONG[0].id,))
+    clock.now_s = 40.0
+    board.tell(Done(LONG[1].id, "done"))
+    (line,) = said.getvalue().splitlines()
+    rest_m, gone_m = LONG[2].route_line.length_m + SETUP_M, LONG[1].route_line.length_m + SETUP_M
+    assert line == f"{LONG[1].id}: done, 2 of 3; about {duration(40.0 * rest_m / gone_m)} left"
+    clock.now_s = 160.0
+    board.tell(Done(LONG[2].id, "crashed"))
+    assert said.getvalue().splitlines()[1] == f"{LONG[2].id}: crashed, 3 of 3"
+
+
+def test_an_episode_that_stands_still_comes_nearer_to_its_end() -> None:
+    """A robot that gets nowhere uses up its time limit: the share is that of the time, and what is left is known."""
+    one = msgspec.structs.replace(SHORT[0], id="stuck")
+    board, clock, _ = board_of((one,))
+    clock.now_s = 30.0
+    board.tell(Progress(one.id, one.time_limit_s / 2, 0.0, 0))
+    length_m = one.route_line.length_m
+    assert board.left.seconds(30.0) == pytest.approx(30.0 * 0.5 * length_m / (0.5 * length_m + SETUP_M))
+
+
+def test_a_comparison_is_part_of_its_episode() -> None:
+    """With --counterfactual an episode at its goal is not over yet: the street without the robot is still to come."""
+    board, clock, _ = board_of(LONG[:1], compared=True)
+    clock.now_s = 70.0
+    board.tell(Progress(LONG[0].id, 100.0, LONG[0].route_line.length_m, 0))
+    at_goal_s = board.left.seconds(70.0)
+    board.tell(Compares(LONG[0].id, 0.5))
+    assert at_goal_s is not None and at_goal_s > 15.0
+    assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
+
+
+def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
+    """Resumed after its last episode: the bar is full."""
+    board, *_ = board_of(LONG[:1], done=(LONG[0].id,))
+    assert board.left.share == 1.0 and "1/1" in str(board.bars.tasks[0].fields["count"])
+
+
+def test_the_bars_fit_80_columns() -> None:
+    """The longest name, thousands of seconds, dozens of failures: no line is broken and nothing is cut."""
+    named = msgspec.structs.replace(LONG[7], id="ped_crossing-001")
+    board, clock, said = board_of((named, *LONG[:2]))
+    clock.now_s = 4000.0
+    board.tell(Progress(named.id, 3185.2, 630.4, 88))
+    board.bars.refresh()
+    Console(file=said, width=80).print(board.bars.get_renderable())
+    lines = said.getvalue().splitlines()
+    assert max(map(len, lines)) <= 80 and "…" not in said.getvalue()
+    way = f"630/{LONG[7].route_line.length_m:.0f} m"
+    assert any("ped_crossing-001" in line and way in line and "88 failures" in line for line in lines)
+    assert any("episodes" in line and "0/3" in line and "left" in line for line in lines)

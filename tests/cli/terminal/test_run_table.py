@@ -1,0 +1,176 @@
+"""Tables of the command line, in a terminal of 80 columns."""
+
+from __future__ import annotations
+
+import io
+import re
+from pathlib import Path
+
+import msgspec
+import pandas as pd
+import pytest
+from rich.console import Console
+
+from cosim.cli.results.show import print_sheet
+from cosim.cli.suites.catalog import print_scenarios
+from cosim.cli.terminal.run_table import (
+    COUNTS,
+    LETTERS,
+    SHOWN,
+    WITH_PEOPLE,
+    print_by_kind,
+    print_table,
+)
+from cosim.core.errors import unknown
+from cosim.judge.metrics import METRICS
+from cosim.spec.scenario import CityMap, Suite
+from scenarios.catalog import SUITES, load_suite
+from scenarios.viewing.eventsheet import COLUMNS
+
+
+def terminal() -> tuple[Console, io.StringIO]:
+    said = io.StringIO()
+    return Console(file=said, width=80), said
+
+
+@pytest.mark.parametrize("name", SUITES)
+def test_the_scenarios_of_a_suite_fit_80_columns(name: str) -> None:
+    """No name and no number is cut, and every scenario has a line with its place."""
+    out, said = terminal()
+    print_scenarios(out, load_suite(name))
+    assert "…" not in said.getvalue()
+    for scenario in load_suite(name).scenarios:
+        assert f" {scenario.id} " in said.getvalue() and f" {scenario.place.name} " in said.getvalue()
+
+
+def test_a_name_with_brackets_is_shown_as_it_is() -> None:
+    """What would end or begin a colour is part of the name of a map."""
+    (scenario,) = load_suite("long-horizon").scenarios[:1]
+    odd = msgspec.structs.replace(scenario, place=CityMap(map="[/x][red]"))
+    out, said = terminal()
+    print_scenarios(out, Suite(name="s", version="1", scenarios=(odd,)))
+    assert " map-[/x][red] " in said.getvalue()
+
+
+def test_a_bad_run_fits_80_columns() -> None:
+    """The longest shipped name, two digits before every point, and dozens of failures: nothing is cut."""
+    row = dict.fromkeys(METRICS, 34.56) | {"scenario": "ped_crossing-001", "status": "done", "ended": "timeout"}
+    row |= {name: 34.56 for name, _ in SHOWN} | {name: 120 for name, _ in COUNTS}  # type: ignore[dict-item]
+    out, said = terminal()
+    print_table(out, pd.DataFrame([row]), 1)
+    assert "…" not in said.getvalue()
+    assert "ped_crossing-001 timeout" in said.getvalue() and "120/120/120" in said.getvalue()
+
+
+def pair_of_kinds() -> tuple[pd.DataFrame, dict[str, str]]:
+    """Two short episodes of two events; a collision each: 1 in the episode, 8.48 in 100 m."""
+    row = dict.fromkeys(METRICS, 1.0) | {"status": "done", "ended": "failure", "reason": ""}
+    row |= {name: 0.25 for name, _ in (*SHOWN, *COUNTS, *WITH_PEOPLE)}  # type: ignore[dict-item]
+    row |= {"collisions": 1.0, "collisions_per_100m": 8.48}  # type: ignore[dict-item]
+    names = ("ped_crossing-001", "frontal-001")
+    return pd.DataFrame([row | {"scenario": n} for n in names]), {n: n.rsplit("-", 1)[0] for n in names}
+
+
+def test_a_letter_means_one_thing_in_every_table() -> None:
+    """C, OL and F are per 100 m wherever they stand; what is counted in another way has a name in words."""
+    table, kinds = pair_of_kinds()
+    episodes, shares = terminal(), terminal()
+    print_table(episodes[0], table, 2)
+    print_by_kind(shares[0], table, kinds)
+    assert "8.48" in episodes[1].getvalue() and "C/OL/F" not in episodes[1].getvalue()
+    heads = shares[1].getvalue().split("ped_crossing")[0].split()
+    assert "person" in heads and not {"RC", "FC", "C", "OL", "F", "V"} & set(heads)
+
+
+def test_every_letter_and_heading_is_explained_under_its_table() -> None:
+    """Letters have their meaning in the line below, rates their unit in the heading, and the README has the same."""
+    table, kinds = pair_of_kinds()
+    out, said = terminal()
+    print_table(out, table, 2)
+    text = " ".join(said.getvalue().split())
+    readme = " ".join((Path(__file__).parents[3] / "README.md").read_text().split())
+    for _, letter in SHOWN:
+        assert f"{letter} {LETTERS[letter]}" in text, letter
+    for letter in ("C", "OL", "F"):
+        assert f"{letter} {LETTERS[letter]}" in readme.replace("`", ""), letter
+    assert text.count("/100m") >= 4 and "m/s" in text
+    out, said = terminal()
+    print_by_kind(out, table, kinds)
+    assert "share of these" in " ".join(said.getvalue().split())
+
+
+def test_the_table_by_kind_fits_80_columns() -> None:
+    """The longest event, hundreds of episodes, an interval: no line is longer than the terminal and none is broken."""
+    table, kinds = pair_of_kinds()
+    out, said = terminal()
+    print_by_kind(out, table, kinds)
+    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
+    assert re.search(r"^ ped_crossing +1 +0\.25 +0\.25\.\.0\.25 ", said.getvalue(), re.MULTILINE)
+
+
+def test_a_whole_suite_by_kind_fits_80_columns_with_all_its_headings() -> None:
+    """A hundred episodes of each event: neither a heading nor a number is cut."""
+    table, kinds = pair_of_kinds()
+    whole = pd.concat([table] * 100, ignore_index=True)
+    out, said = terminal()
+    print_by_kind(out, whole, kinds)
+    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
+    assert re.search(r"^ ped_crossing +100 ", said.getvalue(), re.MULTILINE)
+
+
+def test_the_sheet_of_events_fits_80_columns() -> None:
+    """A long map's name and two digits before each point: numbers and headings are whole."""
+    row = ("sumo-fokr-bs-demo-003 12", "ped_crossing", -19.98, 0.123, 0.060, 1.65, 1.65, -12.34, -180.0, 12.34)
+    out, said = terminal()
+    print_sheet(out, pd.DataFrame([row], columns=list(COLUMNS)))
+    assert "…" not in said.getvalue() and max(map(len, said.getvalue().splitlines())) <= 80
+    for word in ("trigger", "stated", "-19.98", "0.123", "-12.34", "-180", "12.34"):
+        assert word in said.getvalue()
+
+
+def test_of_many_valid_names_the_likely_ones_are_listed() -> None:
+    """Nine hundred scenarios are no answer to a slip of the pen: five are, and how many there are."""
+    names = [scenario.id for scenario in load_suite("reactive").scenarios]
+    assert "frontal-001" in str(unknown("scenario", "frontal-0001", names))
+    assert len(str(unknown("scenario", "x", names))) < 160 and "Valid choices: 900" in str(
+        unknown("scenario", "x", names)
+    )
+
+
+def test_val_and_test_stand_apart() -> None:
+    """A run with both has a row for each; a run of one has none."""
+    rows = [
+        dict.fromkeys(METRICS, 1.0)
+        | {"scenario": f"s-{i}", "status": "done", "ended": "goal", "split": split, "success": float(split == "val")}
+        for i, split in enumerate(("val", "val", "test"))
+    ]
+    out, said = terminal()
+    print_table(out, pd.DataFrame(rows), 3)
+    assert re.search(r"^ +val +2 +1\.00 ", said.getvalue(), re.MULTILINE)
+    assert re.search(r"^ +test +1 +0\.00 ", said.getvalue(), re.MULTILINE) and "…" not in said.getvalue()
+    out, said = terminal()
+    print_table(out, pd.DataFrame(rows[:2]), 2)
+    assert "split" not in said.getvalue()
+
+
+def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() -> None:
+    """Camera, rate, goals, waypoint rule and seed below the rows; who has a camera of its own has a star, and why."""
+    row = {
+        "scenario": "s-1",
+        "status": "done",
+        "ended": "goal",
+        "reason": "",
+        "camera": "own mount, 64 x 64 px, 75 deg",
+    }
+    row |= {"goal_protocol": "route_point", "odometry": "gps", "privileged": True}  # type: ignore[dict-item]
+    row |= {"rate_hz": 4.0, "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped", "run_seed": 7}  # type: ignore[dict-item]
+    row = dict.fromkeys(METRICS, 1.0) | {name: 1.0 for name, _ in (*SHOWN, *COUNTS)} | row  # type: ignore[assignment]
+    for odd, star in (("a camera of its own", True), ("", False)):
+        out, said = terminal()
+        print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
+        text = " ".join(said.getvalue().split())
+        assert (
+            "camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; odometry gps; privileged; waypoint 2, "
+            "units of 1 m, in 0.25 s, shipped; seed 7" in text
+        )
+        assert ("s-1*" in text) is ("* nonstandard, not to be compared: a camera of its own" in text) is star
