@@ -1,22 +1,26 @@
 """Zenoh sessions: the one place that imports zenoh.
 
 Over one explicit endpoint, or within one session: no scouting, no shared memory. A handler that raises answers with its
-error instead of silence.
+error instead of silence. `open_session` opens all that reach another process, as a `Connection` says.
 """
 
 from __future__ import annotations
 
 import json
 import re
+import shutil
+import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
-from cosim.core.errors import EngineError
+from cosim.core.errors import AccessError, EngineError
+from cosim.spec.connection import Connection
 
 Handler = Callable[[bytes], bytes]
 _Heard = zenoh.Subscriber["zenoh.Handler[zenoh.Sample]"]
@@ -29,7 +33,7 @@ _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
 
 
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.Config:
+def _config(mode: str, listen: Sequence[str], connect: Sequence[str], more: Mapping[str, object]) -> zenoh.Config:
     settings: dict[str, object] = {
         "mode": mode,
         "listen/endpoints": list(listen),
@@ -41,6 +45,7 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
         "transport/link/tx/lease": 2000,
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": 16 << 20,
+        **more,
     }
     config = zenoh.Config()
     for key, value in settings.items():
@@ -49,24 +54,33 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str]) -> zenoh.C
 
 
 class Session:
-    """An open Zenoh session. Use as a context manager: a session left open keeps the process alive."""
+    """An open Zenoh session. Use as a context manager: a session left open keeps the process alive.
 
-    def __init__(self, session: zenoh.Session) -> None:
-        self._session = session
+    inside: of one that listens: how processes of its own run on this machine reach it, by a socket that nobody else may
+    open. They may do all; everybody else what their role may.
+    """
+
+    def __init__(self, session: zenoh.Session, inside: Connection | None = None, folder: Path | None = None) -> None:
+        self._session, self._inside, self._folder = session, inside, folder
         self._queryables: list[zenoh.Queryable[None]] = []
         self._subscribers: list[zenoh.Subscriber[Any]] = []
+
+    @property
+    def inside(self) -> Connection:
+        assert self._inside is not None, "this session listens nowhere"
+        return self._inside
 
     @classmethod
     def hub(cls, listen: str) -> Session:
         """The centre of a star: listens at an endpoint such as `unixsock-stream//tmp/a.sock`."""
         remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
-        return cls(_open("router", [listen], [], f"cannot listen at {listen}", remedy))
+        return cls(_open("router", [listen], [], f"cannot listen at {listen}", remedy, {}))
 
     @classmethod
     def client(cls, connect: str) -> Session:
         """A session that connects to a hub; it opens no port of its own."""
         remedy = "Is a process started that listens there, and is the endpoint the same?"
-        return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy))
+        return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy, {}))
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
@@ -139,6 +153,8 @@ class Session:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
             self._subscribers.clear()
             self._session.close()  # type: ignore[no-untyped-call]
+        if self._folder is not None:
+            shutil.rmtree(self._folder, ignore_errors=True)
 
     def __enter__(self) -> Self:
         return self
@@ -158,7 +174,7 @@ class LoneSession(Session):
     """
 
     def __init__(self) -> None:
-        super().__init__(_open("peer", [], [], "cannot open a session", "Has this machine threads to spare?"))
+        super().__init__(_open("peer", [], [], "cannot open a session", "Has this machine threads to spare?", {}))
         self._served: list[tuple[_Heard, _Heard, Handler]] = []
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
@@ -192,8 +208,78 @@ class LoneSession(Session):
             self._session.put(key, answer)
 
 
-def _open(mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str) -> zenoh.Session:
+def open_session(connection: Connection, say: Callable[[str], None] = lambda _: None) -> Session:
+    """Open one end of a session: a hub where it listens, else a client of the hub that it connects to.
+
+    say: told in one line what is insecure, and which certificate ends soon. Raises AccessError for certificates that do
+    not fit, here or there (trying again changes nothing), and EngineError when an endpoint is taken or nobody answers.
+
+    >>> from cosim.spec.connection import Connection
+    >>> with open_session(Connection(role="coordinator", listen="tcp/127.0.0.1:7461")) as hub:
+    ...     with open_session(hub.inside) as one:
+    ...         hub.serve("cosim/r/status", lambda payload: payload.upper())
+    ...         one.ask("cosim/r/status", b"well?", timeout_s=60.0)
+    b'WELL?'
+    """
+    if connection.warning:
+        say(connection.warning)
+    more: dict[str, object] = {}
+    if connection.tls:
+        from bridge.security.identity import checked_identity
+
+        if soon := checked_identity(connection):
+            say(soon)
+        more["transport/link/tls"] = _tls(Path(connection.tls))
+    return _listening(connection, more) if connection.listen else _connected(connection, more)
+
+
+def _tls(folder: Path) -> dict[str, object]:
+    certificate, key = str(folder / "cert.pem"), str(folder / "key.pem")
+    return {
+        "root_ca_certificate": str(folder / "ca.pem"),
+        "listen_certificate": certificate,
+        "listen_private_key": key,
+        "connect_certificate": certificate,
+        "connect_private_key": key,
+        "enable_mtls": True,
+        "verify_name_on_connect": True,
+    }
+
+
+def _listening(connection: Connection, more: Mapping[str, object]) -> Session:
+    remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
+    failure = f"cannot listen at {connection.listen}"
+    if connection.listen.startswith("unixsock-stream/"):
+        inside = Connection(role=connection.role, connect=connection.listen)
+        return Session(_open("router", [connection.listen], [], failure, remedy, more), inside)
+    folder = Path(tempfile.mkdtemp(prefix="cosim-"))
+    inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
-        return zenoh.open(_config(mode, listen, connect))
+        return Session(_open("router", [connection.listen, inside.connect], [], failure, remedy, more), inside, folder)
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+
+
+def _connected(connection: Connection, more: Mapping[str, object]) -> Session:
+    remedy = "Is a process started that listens there, and is the endpoint the same?"
+    try:
+        return Session(
+            _open("client", [], [connection.connect], f"no hub answers at {connection.connect}", remedy, more)
+        )
+    except EngineError as error:
+        if connection.tls:
+            from bridge.security.refusal import why_refused
+
+            if why := why_refused(connection):
+                raise AccessError(why) from error
+        raise
+
+
+def _open(
+    mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str, more: Mapping[str, object]
+) -> zenoh.Session:
+    try:
+        return zenoh.open(_config(mode, listen, connect, more))
     except zenoh.ZError as error:
         raise EngineError(f"Zenoh: {failure} ({_SOURCE_LINE.sub('', str(error)).rstrip('.')}). {remedy}") from error

@@ -5,6 +5,7 @@ CosimError                what a user can mend: shown as one message
 ├── SpecError          2  a scenario, suite or place that contradicts itself (also a ValueError)
 ├── MapError           2  a street net that cannot be read or built
 ├── RunError           2  a run folder that is locked, broken or of another run
+├── AccessError        2  certificates that do not fit, or a right that is lacking
 ├── PolicyError        1  a policy that raised, or answered with something unusable
 ├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
 │   ├── DirectorLost   3  the director of the event pedestrians did not answer
@@ -69,6 +70,12 @@ class MapError(CosimError):
 
 class RunError(CosimError):
     """A run folder that is in use, broken, or belongs to another run."""
+
+    exit_code = WRONG_USE
+
+
+class AccessError(CosimError):
+    """Certificates that do not fit, or a right that this end of a session lacks: trying again changes nothing."""
 
     exit_code = WRONG_USE
 

@@ -1,0 +1,118 @@
+"""What a folder of `--tls` says: whose it is, until when, and whether its files belong together.
+
+Zenoh refuses wrong files without saying which, so they are looked at before a session is opened.
+"""
+
+from __future__ import annotations
+
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Final, NamedTuple, get_args
+
+from cryptography import x509
+from cryptography.exceptions import InvalidSignature
+from cryptography.hazmat.primitives.serialization import load_pem_private_key
+from cryptography.x509.oid import NameOID
+
+from cosim.core.errors import AccessError
+from cosim.spec.connection import Connection, Role
+
+CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
+SOON: Final = timedelta(days=30)
+"""Before the end so long it is said that a certificate ends."""
+
+
+class Identity(NamedTuple):
+    """A certificate as it was read. hosts: the names that others may reach it by; ends: when it, or what it is issued
+    by, expires."""
+
+    role: Role
+    hosts: tuple[str, ...]
+    begins: datetime
+    ends: datetime
+
+
+def identity_in(folder: Path) -> Identity:
+    """Whose the files of a folder are. Raises AccessError when one is missing, or they do not belong together."""
+    certificate, authority = (_certificate(folder / name) for name in (CERTIFICATE, CA))
+    key = folder / KEY
+    try:
+        ours = load_pem_private_key(_read(key), None).public_key() == certificate.public_key()
+    except (ValueError, TypeError) as error:
+        raise AccessError(f"{key}: holds no private key without a password") from error
+    if not ours:
+        raise AccessError(
+            f"{key} is not the key of {folder / CERTIFICATE}: copy the whole folder from where it was made"
+        )
+    if key.stat().st_mode & stat.S_IRWXO:
+        raise AccessError(f"{key} can be read by everybody on this machine: chmod 600 {key}")
+    try:
+        certificate.verify_directly_issued_by(authority)
+    except (ValueError, TypeError, InvalidSignature) as error:
+        raise AccessError(
+            f"{folder / CERTIFICATE} was not issued by {folder / CA}, but by another authority: copy the whole folder "
+            "from where it was made"
+        ) from error
+    names = [str(name.value) for name in certificate.subject.get_attributes_for_oid(NameOID.COMMON_NAME)]
+    role = next((role for role in get_args(Role) if [role] == names), None)
+    if role is None:
+        raise AccessError(
+            f"{folder / CERTIFICATE} is of '{', '.join(names)}', which is no role. Valid choices: "
+            f"{', '.join(get_args(Role))}."
+        )
+    return Identity(
+        role,
+        _hosts(certificate),
+        max(certificate.not_valid_before_utc, authority.not_valid_before_utc),
+        min(certificate.not_valid_after_utc, authority.not_valid_after_utc),
+    )
+
+
+def checked_identity(connection: Connection, now: datetime | None = None) -> str:
+    """Check the files that one end of a session shows, and say if they end soon, else "". Raises AccessError."""
+    folder = Path(connection.tls)
+    found = identity_in(folder)
+    now = datetime.now(UTC) if now is None else now
+    if found.role != connection.role:
+        raise AccessError(
+            f"{folder} is of a {found.role}, and this needs one of a {connection.role}: see `cosim certs`"
+        )
+    if connection.listen and not found.hosts:
+        raise AccessError(f"{folder / CERTIFICATE} names no host: make it anew with --host")
+    renew = f"`cosim certs role ... {found.role} --renew` makes another"
+    if now > found.ends:
+        raise AccessError(f"{folder} has expired on {said(found.ends)} (here it is {said(now)}): {renew}")
+    if now < found.begins:
+        raise AccessError(
+            f"{folder} is valid from {said(found.begins)}, and here it is {said(now)}: is this machine's clock right?"
+        )
+    return f"{folder} expires on {said(found.ends)}: {renew}." if found.ends - now < SOON else ""
+
+
+def said(moment: datetime) -> str:
+    """A moment as it is printed."""
+    return f"{moment:%Y-%m-%d %H:%M} UTC"
+
+
+def _certificate(path: Path) -> x509.Certificate:
+    try:
+        return x509.load_pem_x509_certificate(_read(path))
+    except ValueError as error:
+        raise AccessError(f"{path}: holds no certificate") from error
+
+
+def _read(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise AccessError(f"{path}: cannot be read: {error.strerror}: `cosim certs` makes such a folder") from error
+
+
+def _hosts(certificate: x509.Certificate) -> tuple[str, ...]:
+    try:
+        names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return ()
+    addresses = [str(address) for address in names.get_values_for_type(x509.IPAddress)]
+    return (*names.get_values_for_type(x509.DNSName), *addresses)

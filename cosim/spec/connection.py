@@ -1,0 +1,109 @@
+"""One end of a session over a network: what it does there, where it stands, and what guards it.
+
+An end is open to its own machine alone, or guarded by TLS, or insecure in so many words. This is decided here, before
+anything is opened.
+"""
+
+from __future__ import annotations
+
+import re
+from ipaddress import ip_address
+from typing import Final, Literal
+
+import msgspec
+
+from cosim.core.errors import UsageError
+
+Role = Literal["coordinator", "director", "policy", "worker", "viewer", "injector"]
+HUBS: Final[tuple[Role, ...]] = ("coordinator", "director", "policy")
+"""Roles that others connect to."""
+
+_OVER_IP: Final = re.compile(r"(tcp|tls)/([^/?#]+):(\d{1,5})")
+_OVER_A_FILE: Final = re.compile(r"(unixsock-stream)/([^?#]+)")
+
+
+class Connection(msgspec.Struct, frozen=True, kw_only=True):
+    """An end that listens, or one that connects.
+
+    role: what it does, and whose its certificate must be. listen, connect: one of both, PROTOCOL/ADDRESS:PORT (tcp or
+    tls) or unixsock-stream/PATH. tls: a folder with `ca.pem`, `cert.pem`, `key.pem` (`cosim certs`). insecure: it may
+    reach beyond this machine without TLS. Raises UsageError.
+
+    >>> Connection(role="worker", connect="tls/hub.lan:7447", tls="certs/worker").endpoint
+    'tls/hub.lan:7447'
+    """
+
+    role: Role
+    listen: str = ""
+    connect: str = ""
+    tls: str = ""
+    insecure: bool = False
+
+    def __post_init__(self) -> None:
+        if bool(self.listen) == bool(self.connect):
+            raise UsageError("one end of a session listens or connects: name one endpoint")
+        if self.listen and self.role not in HUBS:
+            raise UsageError(f"a {self.role} listens nowhere, it connects. Those who listen: {', '.join(HUBS)}.")
+        protocol, address = _parts(_well_formed(self.endpoint))
+        if self.tls and self.insecure:
+            raise UsageError("--tls guards and --insecure does not: choose one")
+        if self.tls and protocol != "tls":
+            raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {self.endpoint}")
+        if protocol == "tls" and not self.tls:
+            raise UsageError(
+                f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of a {self.role}: "
+                "`cosim certs` makes them"
+            )
+        if not (self.tls or self.insecure or self.of_this_machine):
+            raise UsageError(
+                f"{self.endpoint} is beyond this machine and unguarded: {self._danger}. Use tls/{address} with "
+                "--tls FOLDER (`cosim certs` makes it), or say --insecure"
+            )
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens or connects to."""
+        return self.listen or self.connect
+
+    @property
+    def of_this_machine(self) -> bool:
+        """Whether nobody on another machine can reach it, or be reached by it."""
+        protocol, address = _parts(self.endpoint)
+        return protocol == "unixsock-stream" or _is_loopback(address.rpartition(":")[0].strip("[]"))
+
+    @property
+    def warning(self) -> str:
+        """What --insecure means here, in one line; "" where nothing is insecure."""
+        return "" if not self.insecure or self.of_this_machine else f"--insecure: {self._danger}."
+
+    @property
+    def _danger(self) -> str:
+        if self.connect:
+            return f"whoever stands between here and {self.connect} may read and change all that is sent"
+        may = {
+            "coordinator": "watch, inject pedestrians, take episodes and tell their results, and answer as a policy",
+            "director": "ask it",
+            "policy": "ask it and see what it answers to",
+        }
+        return f"whoever can reach {self.listen} may {may[self.role]}, and read all that is sent"
+
+
+def _well_formed(endpoint: str) -> str:
+    found = _OVER_IP.fullmatch(endpoint)
+    if not (found and 1 <= int(found[3]) <= 65535) and not _OVER_A_FILE.fullmatch(endpoint):
+        like = "tcp/127.0.0.1:7447, tls/HOST:7447 or unixsock-stream/PATH"
+        raise UsageError(f"endpoint '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
+    return endpoint
+
+
+def _parts(endpoint: str) -> tuple[str, str]:
+    """Protocol and the rest."""
+    protocol, _, rest = endpoint.partition("/")
+    return protocol, rest
+
+
+def _is_loopback(host: str) -> bool:
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        return False

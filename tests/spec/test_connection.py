@@ -1,0 +1,67 @@
+"""Which ends of a session may be opened, and in which words the others are refused."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from cosim.core.errors import UsageError
+from cosim.spec.connection import Connection, Role
+
+LOOPBACK = (
+    "tcp/127.0.0.1:7447",
+    "tcp/127.8.0.1:1",
+    "tcp/localhost:7447",
+    "tcp/[::1]:7447",
+    "unixsock-stream//tmp/a.sock",
+)
+BEYOND = ("tcp/0.0.0.0:7447", "tcp/[::]:7447", "tcp/10.0.0.7:7447", "tcp/hub.lan:7447", "tcp/localhost.evil.org:7447")
+
+
+@pytest.mark.parametrize("endpoint", LOOPBACK)
+def test_this_machine_alone_needs_nothing_more(endpoint: str) -> None:
+    """Loopback and Unix sockets are opened as they are, and nothing is said of danger."""
+    assert Connection(role="coordinator", listen=endpoint).warning == ""
+    assert Connection(role="viewer", connect=endpoint, insecure=True).warning == ""
+
+
+@pytest.mark.parametrize("endpoint", BEYOND)
+def test_beyond_this_machine_needs_tls_or_a_word(endpoint: str) -> None:
+    """Without either it is refused with both remedies; --insecure says in one line what it means."""
+    with pytest.raises(UsageError, match="may watch, inject") as refused:
+        Connection(role="coordinator", listen=endpoint)
+    assert f"Use tls/{endpoint[4:]} with --tls FOLDER" in str(refused.value) and "--insecure" in str(refused.value)
+    with pytest.raises(UsageError, match="stands between here and"):
+        Connection(role="worker", connect=endpoint)
+    warning = Connection(role="coordinator", listen=endpoint, insecure=True).warning
+    assert warning.startswith("--insecure: whoever can reach") and "\n" not in warning
+    assert Connection(role="coordinator", listen=endpoint.replace("tcp", "tls"), tls="certs/coordinator").warning == ""
+
+
+def test_contradictions_are_refused() -> None:
+    """TLS without files, files without TLS, both and insecure, two endpoints or none, one who never listens, others."""
+    cases: list[tuple[str, dict[str, object]]] = [
+        ("needs --tls FOLDER, which holds ca.pem", {"listen": "tls/0.0.0.0:7447"}),
+        ("--tls goes with tls/ADDRESS:PORT", {"listen": "tcp/127.0.0.1:7447", "tls": "certs"}),
+        ("choose one", {"listen": "tls/0.0.0.0:7447", "tls": "certs", "insecure": True}),
+        ("name one endpoint", {}),
+        ("name one endpoint", {"listen": "tcp/127.0.0.1:7447", "connect": "tcp/127.0.0.1:7447"}),
+        ("a worker listens nowhere", {"listen": "tcp/127.0.0.1:7447", "role": "worker"}),
+        ("write it as PROTOCOL/ADDRESS", {"listen": "7447"}),
+        ("write it as PROTOCOL/ADDRESS", {"listen": "udp/127.0.0.1:7447"}),
+        ("write it as PROTOCOL/ADDRESS", {"listen": "tls/h:7447#verify_name_on_connect=false", "tls": "certs"}),
+        ("write it as PROTOCOL/ADDRESS", {"listen": "tcp/127.0.0.1:70000"}),
+    ]  # fmt: skip
+    for words, given in cases:
+        with pytest.raises(UsageError, match=words):
+            Connection(**{"role": "coordinator", **given})  # type: ignore[arg-type]
+
+
+def test_it_travels_to_other_processes_as_it_is() -> None:
+    """A connection is the same after MessagePack, and is checked again there."""
+    role: Role = "worker"
+    one = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
+    assert msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=Connection) == one
+    bad = msgspec.msgpack.encode({"role": role, "connect": "tcp/hub.lan:7447"})
+    with pytest.raises(UsageError, match="unguarded"):
+        msgspec.msgpack.decode(bad, type=Connection)
