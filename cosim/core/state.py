@@ -212,6 +212,18 @@ class Command:
     w_radps: float
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Planned(Command):
+    """The command that follows one of waypoints, with these.
+
+    waypoints: (N, 2) float32, x ahead and y left of the robot at its observation, metres; (N, 4) with the cosine and
+    the sine of the heading there. index: which one is followed.
+    """
+
+    waypoints: NDArray[np.float32]
+    index: int
+
+
 STILL = Command(0.0, 0.0)
 
 

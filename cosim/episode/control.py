@@ -11,7 +11,8 @@ import math
 import numpy as np
 
 from cosim.core.errors import PolicyError
-from cosim.core.state import STILL, Command
+from cosim.core.geometry import Floats
+from cosim.core.state import STILL, Command, Planned
 from cosim.episode.ports import WaypointRule
 from cosim.spec.robot import Robot
 
@@ -20,6 +21,9 @@ REAL_KINDS = "iuf"
 """The kinds of numpy that are real numbers: integers, unsigned, floating."""
 _MOST_SHOWN = 80
 _COLUMNS = (2, 4)
+_MOST_KEPT = 256
+"""Of the waypoints of one answer so many are told of it, and all up to the one that is followed."""
+_LARGEST = float(np.finfo(np.float32).max)
 
 
 def _followed(x_m: float, y_m: float, heading_rad: float | None, rule: WaypointRule) -> Command:
@@ -44,7 +48,8 @@ def clipped(command: Command, robot: Robot) -> Command:
 
 
 def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
-    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which one is followed.
+    """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which one is followed, as a
+    Planned.
 
     Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule needs, and anything
     that is not real numbers of that shape: truth values, texts and complex numbers are none.
@@ -55,14 +60,26 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
         if not all(map(math.isfinite, numbers)):
             shown = ", ".join(f"{name}={_shown(s)}" for name, s in zip(("v_mps", "w_radps"), speeds, strict=True))
             raise PolicyError(f"answered Command({shown}): both must be finite numbers")
-        return clipped(Command(*numbers), robot)
-    x, y, *turn = _waypoint(answer, rule.index)
+        command = clipped(Command(*numbers), robot)
+        if not isinstance(answer, Planned):
+            return command
+        return _planned(command, _waypoints(answer.waypoints, rule.index), rule.index)
+    waypoints = _waypoints(answer, rule.index)
+    x, y, *turn = waypoints[rule.index].tolist()
     heading_rad = math.atan2(turn[1], turn[0]) if turn else None
-    return clipped(_followed(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
+    command = clipped(_followed(x * rule.unit_m, y * rule.unit_m, heading_rad, rule), robot)
+    waypoints[:, :2] *= rule.unit_m
+    return _planned(command, waypoints, rule.index)
 
 
-def _waypoint(answer: object, index: int) -> list[float]:
-    """One of waypoints (N, 2) or (N, 4), all of which must be finite."""
+def _planned(command: Command, waypoints: Floats, index: int) -> Planned:
+    """A command with the waypoints in metres that it follows one of."""
+    kept = np.clip(waypoints[: max(_MOST_KEPT, index + 1)], -_LARGEST, _LARGEST).astype(np.float32)
+    return Planned(command.v_mps, command.w_radps, kept, index)
+
+
+def _waypoints(answer: object, index: int) -> Floats:
+    """Waypoints (N, 2) or (N, 4), a copy, all of which must be finite; more of them than `index`."""
     try:
         array = np.asarray(answer)
     except (TypeError, ValueError) as error:  # rows of different lengths
@@ -83,8 +100,7 @@ def _waypoint(answer: object, index: int) -> list[float]:
             f"answered waypoints of shape {array.shape}, and waypoint {index} (from 0) is followed: answer at least "
             f"{index + 1}, or say which one in the manifest, as waypoints=WaypointRule(index={len(waypoints) - 1})"
         )
-    row: list[float] = waypoints[index].tolist()
-    return row
+    return waypoints
 
 
 def _number(value: object) -> float:

@@ -13,9 +13,12 @@ import math
 from collections import deque
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.core.state import STILL, Command
+from cosim.core.state import STILL, Command, Planned
+
+_NO_PLAN = np.empty((0, 2), dtype=np.float32)
 
 
 class InFlight:
@@ -25,6 +28,8 @@ class InFlight:
         self._way: deque[tuple[int, Command]] = deque()
         self._holds = STILL
         self._answers: list[tuple[float, float, float, float]] = []
+        self._plans: list[NDArray[np.float32]] = []
+        self._index = 0
         self.arrived_by = 0
         """The tick at which the last command takes effect."""
 
@@ -33,6 +38,11 @@ class InFlight:
         self.arrived_by = tick + delay
         self._way.append((self.arrived_by, command))
         self._answers.append((tick, delay, command.v_mps, command.w_radps))
+        if isinstance(command, Planned):
+            self._plans.append(command.waypoints)
+            self._index = command.index
+        else:
+            self._plans.append(_NO_PLAN)
 
     def at(self, tick: int) -> Command:
         """The command that holds during a tick."""
@@ -49,6 +59,16 @@ class InFlight:
     def answers(self) -> Floats:
         """(A, 4), as in `cosim.episode.log.Log`."""
         return np.array(self._answers, dtype=float).reshape(-1, 4)
+
+    @property
+    def plans(self) -> tuple[NDArray[np.int32], NDArray[np.float32], int]:
+        """plan_sizes (A,), plan_points (W, 2) or (W, 4) and plan_index, as in `cosim.episode.log.Log`; without
+        waypoints plan_sizes is (0,)."""
+        sizes = np.array([len(plan) for plan in self._plans], dtype=np.int32)
+        points = np.full((sizes.sum(), max((plan.shape[1] for plan in self._plans), default=2)), np.nan, np.float32)
+        for plan, end in zip(self._plans, np.cumsum(sizes).tolist(), strict=True):
+            points[end - len(plan) : end, : plan.shape[1]] = plan
+        return sizes if len(points) else sizes[:0], points, self._index
 
 
 def whole_ticks(latency_ms: float, tick_ms: int) -> int:

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 
+_OF_PLANS = {"plan_sizes", "plan_points", "plan_index"}
+_LATER = {"answers"} | _OF_PLANS
+"""What a file need not have."""
+
 
 @dataclass(frozen=True)
 class Log:
@@ -31,6 +35,10 @@ class Log:
     answers (A, 4): the tick of an observation, the ticks until the policy's answer to it took effect, and the command
     that it was, v m/s and w rad/s; what was on its way when the robot was put elsewhere never did
     (`cosim.episode.in_flight`). Empty in a file that was written before there were any.
+    plan_sizes (A,): how many waypoints each of the answers was, 0 for a command; plan_points (W, 2) float32: these
+    waypoints one answer after another, x ahead and y left of the robot at its observation, metres; (W, 4) with cosine
+    and sine of the heading there, NaN where an answer told none; plan_index: which of an answer is followed, from 0.
+    Without waypoints plan_sizes and plan_points are empty, and no part of the file.
 
     `Log.load` reads the trajectory.npz of a run folder and raises RunError naming the file.
 
@@ -58,6 +66,9 @@ class Log:
     people_age: NDArray[np.int8]
     event_tracks: Floats
     answers: Floats = filled(default_factory=lambda: np.empty((0, 4)))
+    plan_sizes: NDArray[np.int32] = filled(default_factory=lambda: np.empty(0, np.int32))
+    plan_points: NDArray[np.float32] = filled(default_factory=lambda: np.empty((0, 2), np.float32))
+    plan_index: int = 0
 
     def __len__(self) -> int:
         return len(self.pose)
@@ -78,7 +89,8 @@ class Log:
     def encoded(self) -> bytes:
         """The compressed .npz that is the file."""
         file = io.BytesIO()
-        arrays = {f.name: np.asarray(getattr(self, f.name)) for f in fields(self)}
+        names = [f.name for f in fields(self) if len(self.plan_points) or f.name not in _OF_PLANS]
+        arrays = {name: np.asarray(getattr(self, name)) for name in names}
         np.savez_compressed(file, allow_pickle=False, **arrays)
         return file.getvalue()
 
@@ -88,7 +100,12 @@ class Log:
         try:
             with np.load(path, allow_pickle=False) as arrays:
                 held = dict(arrays)
-                values = {f.name: held[f.name] for f in fields(cls) if f.name in held or f.name != "answers"}
+                values = {f.name: held[f.name] for f in fields(cls) if f.name in held or f.name not in _LATER}
+            if values.keys() & _OF_PLANS:
+                counts = len(held["plan_sizes"]), held["plan_sizes"].sum()
+                if counts != (len(held["answers"]), len(held["plan_points"])):
+                    raise ValueError("plan_sizes, plan_points and answers are not of each other")
+                values["plan_index"] = int(held["plan_index"])
         except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
             raise RunError(f"{path}: not a trajectory: {error}") from error
         values["tick_s"] = float(values["tick_s"])

@@ -18,6 +18,7 @@ from cosim.core.geometry import Floats
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
 from cosim.episode.camera_rules import nonstandard
+from cosim.episode.in_flight import InFlight
 from cosim.episode.log import Log
 from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
 from cosim.episode.step import Step
@@ -256,10 +257,11 @@ class Recorder:
             for xy, kind, age in zip(people.xy.tolist(), people.kind.tolist(), people.age.tolist(), strict=True):
                 self._people.append((step.tick, *xy, kind, age))
 
-    def log(self, event_tracks: Floats, answers: Floats) -> Log:
-        """The episode so far. event_tracks, answers: see `Log`."""
+    def log(self, event_tracks: Floats, commands: InFlight) -> Log:
+        """The episode so far. event_tracks: see `Log`; commands: all that the policy answered."""
         rows = np.array(self._rows, dtype=float).reshape(-1, 16)
         people = np.array(self._people, dtype=float).reshape(-1, 5)
+        plan_sizes, plan_points, plan_index = commands.plans
         return Log(
             tick_s=self._tick_s,
             pose=rows[:, 0:3],
@@ -279,5 +281,8 @@ class Recorder:
             people_kind=people[:, 3].astype(np.int8),
             people_age=people[:, 4].astype(np.int8),
             event_tracks=event_tracks,
-            answers=answers,
+            answers=commands.answers,
+            plan_sizes=plan_sizes,
+            plan_points=plan_points,
+            plan_index=plan_index,
         )

@@ -214,7 +214,7 @@ class Episode:
         if not self.over:
             raise UsageError("this Episode is not over: advance() it until `over`, then ask for its result()")
         if self._result is None:
-            record, log = self._scorer.result(self.record, self._commands.answers)
+            record, log = self._scorer.result(self.record, self._commands)
             clock = {"wall_s": time.perf_counter() - self._began_s, "setup_s": self._setup_s}
             self._result = msgspec.structs.replace(record, injections=self._injected.log, clock=clock), log
         return self._result

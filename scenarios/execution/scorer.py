@@ -5,8 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.clock import Clock
-from cosim.core.geometry import Floats
-from cosim.episode.in_flight import median_ms
+from cosim.episode.in_flight import InFlight, median_ms
 from cosim.episode.log import Log
 from cosim.episode.step import Step
 from cosim.judge.event_monitor import EventMonitor, Hidden, why_invalid
@@ -55,16 +54,16 @@ class Scorer:
             self._red_lights.append(RedLightEntry(step.tick, verdict.red_light_entry))
         return verdict
 
-    def result(self, begun: Record, answers: Floats) -> tuple[Record, Log]:
-        """The record that was begun, with all that came out so far, and the log. answers: as in `Log`."""
+    def result(self, begun: Record, commands: InFlight) -> tuple[Record, Log]:
+        """The record that was begun, with all that came out so far, and the log. commands: all that was answered."""
         scenario, events = self._scenario, self._monitor.outcomes()
-        log = self._recorder.log(self._monitor.tracks, answers)
+        log = self._recorder.log(self._monitor.tracks, commands)
         record = msgspec.structs.replace(
             begun,
             ended=self._verdict.ended,
             ticks=len(log),
             state_hash=self._recorder.hash.hexdigest(),
-            latency_ms=median_ms(answers, self._clock.tick_ms) if begun.real_time else begun.latency_ms,
+            latency_ms=median_ms(log.answers, self._clock.tick_ms) if begun.real_time else begun.latency_ms,
             failures=tuple(self._failures),
             walked_into=tuple(self._walked_into),
             red_light_entries=tuple(self._red_lights),

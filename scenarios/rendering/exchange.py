@@ -12,6 +12,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from cosim.core.state import People, RobotState, Signal, Street, Vehicles, write_protected
 from cosim.spec.goal import Goal
@@ -89,10 +90,12 @@ class Fine(msgspec.Struct, frozen=True, tag=True):
 
 
 class Told(msgspec.Struct, frozen=True, tag=True):
-    """The policy's command, within the robot's limits."""
+    """The policy's command, within the robot's limits; waypoints, index: as in `Planned`, where it was one."""
 
     v_mps: float
     w_radps: float
+    waypoints: NDArray[np.float32] | None = None
+    index: int = 0
 
 
 class Refused(msgspec.Struct, frozen=True, tag=True):
@@ -123,7 +126,7 @@ def _array(kind: type, packed: Any) -> Any:
 
 _encode = msgspec.msgpack.Encoder(enc_hook=_in_bytes).encode
 decode_request = msgspec.msgpack.Decoder(Request, dec_hook=_array).decode
-decode_reply = msgspec.msgpack.Decoder(Reply).decode
+decode_reply = msgspec.msgpack.Decoder(Reply, dec_hook=_array).decode
 decode_renderer_hello = msgspec.msgpack.Decoder(RendererHello).decode
 
 

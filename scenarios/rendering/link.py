@@ -17,7 +17,7 @@ import msgspec
 import shapely
 
 from cosim.core.errors import EngineError, PolicyError, RendererLost
-from cosim.core.state import Command, Frame, RobotState, Street
+from cosim.core.state import Command, Frame, Planned, RobotState, Street
 from cosim.episode.driver import Driver, when
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.spec.options import RendererAt
@@ -171,7 +171,9 @@ class AskedElsewhere(Driver):
         request = Ask(seen.tick, seen.v_mps, seen.w_radps, told, seen.reset, seen.goal, seen.odometry)
         reply = link_to(self._address).ask(request, when("act", observation.tick))
         assert isinstance(reply, Told)
-        return Command(reply.v_mps, reply.w_radps)
+        if reply.waypoints is None:
+            return Command(reply.v_mps, reply.w_radps)
+        return Planned(reply.v_mps, reply.w_radps, reply.waypoints, reply.index)
 
     def _told(self, known: Privileged) -> Knowledge:
         """What the renderer is told of it: the ground where the robot may be once for each episode."""

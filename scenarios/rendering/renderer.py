@@ -27,6 +27,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
+from cosim.core.state import Planned
 from cosim.episode.driver import BatchDriver, said_by
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import Observation, Privileged
@@ -277,7 +278,8 @@ class _Renderer:
             if isinstance(answer, PolicyError):
                 one.reply(Refused(str(answer), by_policy=True))
             else:
-                one.reply(Told(answer.v_mps, answer.w_radps))
+                plan = (answer.waypoints, answer.index) if isinstance(answer, Planned) else ()
+                one.reply(Told(answer.v_mps, answer.w_radps, *plan))
 
     def _observed(self, one: _Environment) -> Observation:
         """What the policy is given for an environment."""

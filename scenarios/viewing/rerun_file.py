@@ -2,6 +2,7 @@
 
     world/map/...           ground by kind, fences, obstacles, the route, the goal; static
     world/robot             where the robot is; plan: where its command leads; camera: rgb, depth, labels
+    world/waypoints         those that its policy planned, the followed one large; only where it answered any
     world/people, vehicles  bodies by kind; people/velocity: arrows of a second
     world/signals           red and green, over the crossings near the robot
     plots/...               speed, turn, command, gap to the nearest person, way, delay of the answers
@@ -28,8 +29,9 @@ from shapely.geometry import MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import unwritable
 from cosim.core.geometry import Floats, Pose
-from cosim.core.state import LABELS, PERSON_RADIUS_M, Command, Street
+from cosim.core.state import LABELS, PERSON_RADIUS_M, Street
 from cosim.core.telling import Tell, untold
+from cosim.episode.following import Following
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
@@ -44,6 +46,7 @@ from cosim.spec.scenario import Scenario
 from physics.world.surface import Surface
 from scenarios.execution.places import place, surface_of_place
 from scenarios.execution.replay import Alike, Recorded, check, recorded, replaying
+from scenarios.viewing.drawn_way import led_to
 
 PICTURE_EVERY_TICKS: Final = 5
 _AROUND_M: Final = 40.0
@@ -54,6 +57,7 @@ _PICTURES: Final = ("rgb", "depth", "labels")
 _WALK: Final[Rgb255] = (214, 210, 200)
 _CROSSING: Final[Rgb255] = (240, 232, 140)
 _GREEN: Final[Rgb255] = (0, 170, 80)
+_PLANNED: Final[Rgb255] = (15, 163, 177)
 _SPEC: Final = CameraSpec(width=192, height=144, fov_deg=75.0)
 _LABEL_COLOURS: Final = (
     (135, 190, 235), (90, 90, 95), (214, 210, 200), (240, 232, 140), (170, 170, 170), (120, 180, 110), (150, 140, 120),
@@ -98,7 +102,10 @@ def record_for_rerun(
 def _blueprint(rrb: Any) -> Any:
     """Street on the left, pictures on the right, plots and words below."""
     camera = "world/robot/camera"
-    pictures = rrb.Vertical(*(rrb.Spatial2DView(origin=f"{camera}/{name}", name=name) for name in _PICTURES))
+    contents = ["$origin/**", "/world/robot/plan", "/world/waypoints/**"]
+    pictures = rrb.Vertical(
+        *(rrb.Spatial2DView(origin=f"{camera}/{name}", contents=contents, name=name) for name in _PICTURES)
+    )
     plots = [rrb.TimeSeriesView(origin=f"plots/{name}", name=name) for name in ("speed", "turn", "near", "way")]
     return rrb.Blueprint(
         rrb.Vertical(
@@ -133,6 +140,8 @@ class _Tape:
         self._robot = robot_called(told.scenario.robot)
         self._triggered: set[str] = set()
         self._middles: dict[str, Floats] = {}
+        self._following = Following(told.log)
+        self._planned: Floats | None = None
         self._surface: Surface
 
     def _log(self, path: str, what: Any, static: bool = False) -> None:
@@ -223,8 +232,9 @@ class _Tape:
         turn = rr.RotationAxisAngle(axis=[0, 0, 1], angle=robot.pose.heading_rad)
         here = rr.Transform3D(translation=[robot.pose.x_m, robot.pose.y_m, robot.z_m], rotation=turn)
         self._log("world/robot", here)
-        plan = rr.LineStrips3D([_led_to(step.command)], colors=[_GREEN], radii=[0.04])
-        self._log("world/robot/plan", plan)
+        led = np.column_stack([led_to(step.command, Pose(0.0, 0.0, 0.0), _LEADS_S), np.full(16, 0.1)])
+        self._log("world/robot/plan", rr.LineStrips3D([led], colors=[_GREEN], radii=[0.04]))
+        self._waypoints(self._following.take(step, verdict.reset is not None))
         self._street(step.street_after, robot.pose)
         self._say(step, verdict)
         if step.tick % PICTURE_EVERY_TICKS == 0:
@@ -236,6 +246,17 @@ class _Tape:
                 self._log(f"{camera}/depth", rr.DepthImage(millimetres, meter=1000.0))
             if frame.labels is not None:
                 self._log(f"{camera}/labels", rr.SegmentationImage(frame.labels))
+
+    def _waypoints(self, plan: Floats | None) -> None:
+        """Those that are followed from now on, if they are others."""
+        if plan is self._planned:
+            return
+        self._planned = plan
+        points = self._on_ground(np.empty((0, 2)) if plan is None else plan, 0.1)
+        radii = np.where(np.arange(len(points)) == self._following.follows, 0.1, 0.05)[1:]
+        dots = self._rr.Points3D(points[1:], radii=radii, colors=[_PLANNED])
+        self._log("world/waypoints/line", self._rr.LineStrips3D([points], colors=[_PLANNED], radii=[0.03]))
+        self._log("world/waypoints/points", dots)
 
     def _street(self, street: Street, robot: Pose) -> None:
         """Who and what is near the robot."""
@@ -304,12 +325,3 @@ def _triangles(shape: Polygon | MultiPolygon) -> Floats:
     """(T, 3, 2) triangles that cover a polygon."""
     faces = shapely.get_parts(shapely.constrained_delaunay_triangles(shape))
     return shapely.get_coordinates(faces).reshape(-1, 4, 2)[:, :3]
-
-
-def _led_to(command: Command) -> Floats:
-    """(N, 3) where a command leads in two seconds, in the robot's frame, a little above the ground."""
-    at_s = np.linspace(0.0, _LEADS_S, 11)
-    turn = command.w_radps * at_s
-    along = command.v_mps * at_s
-    half = np.sinc(turn / (2.0 * np.pi))
-    return np.column_stack([along * half * np.cos(turn / 2), along * half * np.sin(turn / 2), np.full(11, 0.1)])

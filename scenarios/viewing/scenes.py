@@ -16,6 +16,7 @@ import shapely
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
 from cosim.core.state import PersonKind, RobotState, Street
+from cosim.episode.following import Following
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
@@ -23,12 +24,14 @@ from cosim.place.street_map import StreetMap
 from cosim.report.above import street_areas
 from cosim.report.legend import Image
 from cosim.report.page.reasons import Mishap, Other
-from cosim.report.page.scene import CrossingLight, Outline, Pictures, Scene, Track
+from cosim.report.page.scene import CrossingLight, DrawnWay, Outline, Pictures, Scene, Track
 from cosim.spec.obstacle import footprint
 from cosim.spec.options import CameraChoice
-from cosim.spec.scenario import Scenario
-from scenarios.execution.places import place
-from scenarios.execution.replay import Alike, recorded, replaying
+from cosim.spec.robot import robot_called
+from physics.cameras.view import robot_shot
+from scenarios.execution.places import place, surface_of_place
+from scenarios.execution.replay import Alike, Recorded, recorded, replaying
+from scenarios.viewing.drawn_way import led_to, way_in_picture
 from scenarios.viewing.look import eye_behind
 
 SHOWN_S: Final = 10.0
@@ -61,17 +64,19 @@ def show_again(folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera
     """Run a recorded episode again up to the last of these failures. Raises RunError when it comes out otherwise."""
     told = recorded(folder, scenario_id)
     _, street_map = place(told.scenario.place)
-    reels = [_Reel(told.scenario, mishap) for mishap in mishaps]
+    following = Following(told.log)
+    reels = [_Reel(told, mishap, following.follows) for mishap in mishaps]
     last = max(mishap.tick for mishap in mishaps) + 1
     with ExitStack() as stack:
         episode, policy = replaying(told, camera)
         stack.enter_context(episode)
-        eyes = stack.enter_context(episode.eyes(robots_camera(told.record.camera)))
+        eyes = stack.enter_context(episode.eyes(reels[0].spec))
         episode.watch(Alike(folder, told).watch)
 
-        def watch(step: Step, _: Verdict) -> None:
+        def watch(step: Step, verdict: Verdict) -> None:
+            plan = following.take(step, verdict.reset is not None)
             for reel in reels:
-                reel.take(step, eyes)
+                reel.take(step, eyes, plan)
 
         episode.watch(watch)
         observation = episode.reset()
@@ -91,22 +96,25 @@ def robots_camera(spec: CameraSpec | None) -> CameraSpec:
 
 
 class _Reel:
-    """Collects the moments before one failure."""
+    """Collects the moments before one failure. spec: the robot's camera; follows: see `Following`."""
 
-    def __init__(self, scenario: Scenario, mishap: Mishap) -> None:
-        self._scenario, self._mishap = scenario, mishap
+    def __init__(self, told: Recorded, mishap: Mishap, follows: int) -> None:
+        self._scenario, self._mishap, self._follows = told.scenario, mishap, follows
+        self.spec = robots_camera(told.record.camera)
         self._first = max(0, mishap.tick - Clock().ticks(SHOWN_S))
         self._first += (mishap.tick - self._first) % _STEP_TICKS
         self._pictured = mishap.tick - Clock().ticks(PICTURED_S)
         self._robot: list[tuple[float, ...]] = []
         self._streets: list[Street] = []
+        self._plans: list[tuple[int, Floats | None]] = [(0, None)]
+        self._ways: list[DrawnWay] = []
         self._at: list[int] = []
         self._seen: list[str] = []
         self._followed: list[str] = []
         self._ahead: Floats = np.zeros(2)
 
-    def take(self, step: Step, eyes: Eyes) -> None:
-        """One tick."""
+    def take(self, step: Step, eyes: Eyes, plan: Floats | None) -> None:
+        """One tick. plan: the waypoints that are followed (`Following.take`)."""
         before = self._mishap.tick - step.tick
         if step.tick < self._first or before < 0:
             return
@@ -116,13 +124,29 @@ class _Reel:
         if before % _STEP_TICKS == 0:
             self._robot.append((*robot.pose, robot.v_mps, step.command.v_mps, step.command.w_radps))
             self._streets.append(street)
+            if plan is not self._plans[-1][1]:
+                self._plans.append((len(self._robot) - 1, plan))
         if step.tick >= self._pictured and before % _PICTURE_TICKS == 0:
             self._at.append(len(self._robot) - 1)
             self._seen.append(image_url(eyes.render(robot, street).rgb))
+            self._ways.append(self._way(step, plan))
             self._followed.append(self._behind(robot, street, eyes))
 
     def _behind(self, robot: RobotState, street: Street, eyes: Eyes) -> str:
         return image_url(eyes.picture(*eye_behind(robot, self._ahead), street, robot, FOLLOW_PX).rgb)
+
+    def _way(self, step: Step, plan: Floats | None) -> DrawnWay:
+        """What is followed, or where the command leads, in the robot's picture."""
+        robot, surface = step.motion.robot, surface_of_place(self._scenario.place)
+        way = led_to(step.command, robot.pose) if plan is None else plan
+        shot = robot_shot(surface, robot_called(self._scenario.robot), self.spec, robot)
+        lines, points = way_in_picture(shot, self.spec.lens, np.column_stack([way, surface.heights(way)]))
+        tenths = [_whole(10.0 * line) for line in lines]
+        if plan is None:
+            return DrawnWay(tenths)
+        there = np.isfinite(points[:, 0]) & (np.arange(len(points)) > 0)
+        follows = int(there[: self._follows].sum()) if there[self._follows] else -1
+        return DrawnWay(tenths, _whole(10.0 * points[there]), follows)
 
     def showing(self, street_map: StreetMap, size_m: tuple[float, float]) -> ShownAgain:
         """All of it, around the robot's place at the failure."""
@@ -144,8 +168,10 @@ class _Reel:
             ground=self._ground(street_map, track[:, :2], origin),
             route=_ring(self._near(np.array(self._scenario.route), track[-1, :2]), origin),
             goal=tuple(_ring(np.array([self._scenario.goal]), origin)),  # type: ignore[arg-type]
-            pictures=Pictures(self._at, self._seen, self._followed),
+            pictures=Pictures(self._at, self._seen, self._followed, self._ways, (self.spec.width, self.spec.height)),
             hit=hit,
+            plans=[(k, [] if plan is None else _ring(plan, origin)) for k, plan in self._plans[1:]],
+            follows=self._follows,
         )
         return ShownAgain(scene, None if hit < 0 else _other(track[-1], tracks[hit], origin))
 

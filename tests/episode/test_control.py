@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError, SpecError
-from cosim.core.state import Command
+from cosim.core.state import Command, Planned
 from cosim.episode.control import command_of
 from cosim.episode.ports import WaypointRule
 from cosim.spec.robot import COURIER, Robot
@@ -23,7 +23,9 @@ QUICK = dataclasses.replace(COURIER, w_max_radps=100.0)
 
 
 def of(answer: object, rule: WaypointRule = WaypointRule(), robot: Robot = COURIER) -> Command:  # noqa: B008  frozen
-    return command_of(answer, rule=rule, robot=robot)
+    command = command_of(answer, rule=rule, robot=robot)
+    assert isinstance(command, Planned) == (not isinstance(answer, Command))
+    return Command(command.v_mps, command.w_radps)
 
 
 # x, y, heading (None without one), then w by the shipped rule and by atan2, worked out by hand for a step of 0.25 s.
@@ -69,6 +71,20 @@ def test_the_manifest_says_which_waypoint_is_followed_and_in_which_units() -> No
     assert of(answer, WaypointRule(index=3, unit_m=0.5, dt_s=0.5), QUICK) == Command(0.5, math.pi / 2.0)
     scaled = WaypointRule(index=0, unit_m=10.0)
     assert of([[1e-9, 1e-9, 0.0, 1.0]], scaled, QUICK) == of([[1e-8, 1e-8, 0.0, 1.0]], WaypointRule(index=0), QUICK)
+
+
+def test_a_command_tells_the_waypoints_that_it_follows_one_of() -> None:
+    """In metres, as they were answered, with the index; asked again it is the same; nobody tells any that are none."""
+    rule = WaypointRule(index=1, unit_m=0.5)
+    told = command_of([[1.0, 0.5, 0.6, 0.8], [2.0, -1.0, 1.0, 0.0]], rule=rule, robot=COURIER)
+    assert isinstance(told, Planned) and told.index == 1 and told.waypoints.dtype == np.float32
+    assert np.array_equal(told.waypoints, np.float32([[0.5, 0.25, 0.6, 0.8], [1.0, -0.5, 1.0, 0.0]]))
+    again = command_of(told, rule=rule, robot=COURIER)
+    assert isinstance(again, Planned) and again == told and np.array_equal(again.waypoints, told.waypoints)
+    with pytest.raises(PolicyError, match=r"shape \(3,\)"):
+        of(dataclasses.replace(told, waypoints=np.zeros(3, np.float32)))
+    many = command_of([[1e300, 0.0]] * 1000, rule=WaypointRule(), robot=COURIER)
+    assert isinstance(many, Planned) and many.waypoints.shape == (256, 2) and np.isfinite(many.waypoints).all()
 
 
 def test_fewer_waypoints_than_the_rule_needs_are_refused_with_the_remedy() -> None:

@@ -15,7 +15,7 @@ from shapely.geometry import box
 
 from cosim.core.errors import PolicyError
 from cosim.core.geometry import Polyline, Pose
-from cosim.core.state import STILL, Command, People, RobotState, Signal, Vehicles
+from cosim.core.state import STILL, Command, People, Planned, RobotState, Signal, Vehicles
 from cosim.episode.driver import BatchDriver, Driver, PolicyCall
 from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
 from cosim.spec.goal import ImageGoal, RoutePatch
@@ -247,7 +247,11 @@ def test_a_batch_is_answered_in_its_order() -> None:
         Command(0.2, COURIER.w_max_radps),
         Command(0.4, COURIER.w_max_radps),
     ]
-    assert of_two(lambda two: np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3])) == [Command(0.4, 0.0), Command(0.8, 0.0)]
+    planned = of_two(lambda two: np.array([[[0.1, 0.0]] * 3, [[0.2, 0.0]] * 3]))
+    assert [(one.v_mps, one.waypoints[0, 0]) for one in planned if isinstance(one, Planned)] == [
+        (0.4, np.float32(0.1)),
+        (0.8, np.float32(0.2)),
+    ]
 
 
 def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:

@@ -16,7 +16,9 @@ from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
 from scenarios.checks import small_scenario
 from scenarios.execution.episode import Episode
+from scenarios.execution.replay import Recorded, replayed
 from scenarios.execution.run import run_episode
+from tests.report.blind import BEND, Blind
 
 pytestmark = pytest.mark.engine
 
@@ -57,6 +59,18 @@ def test_an_episode_is_driven_by_hand_to_the_result_of_a_run(scenario: Scenario)
     assert (record.ended, record.ticks, len(log), observation.time_s) == ("timeout", 40, 40, 2.0)
     assert episode.result()[0] is record
     assert run_episode(scenario, Ahead()).record.state_hash == record.state_hash
+
+
+def test_waypoints_are_recorded_as_they_were_answered_and_the_record_replays(scenario: Scenario) -> None:
+    """Blind gives commands for a second, then waypoints, all of which its trajectory has, with the followed one; run
+    again it comes to the same state hash."""
+    came = run_episode(scenario, Blind())
+    record, log = came.record, came.log
+    assert log is not None and log.answers[:, 0].tolist() == [*range(0, 40, 4)]
+    assert log.plan_sizes.tolist() == [0] * 5 + [8] * 5 and log.plan_index == 2
+    assert np.array_equal(log.plan_points, np.tile(BEND.astype(np.float32), (5, 1)))
+    assert log.command.tolist() == [[1.2, 0.0]] * 40
+    assert replayed(Recorded(scenario, record, log)) == record.state_hash
 
 
 def test_an_episode_stops_within_a_period_for_who_wants_to_look(scenario: Scenario) -> None:

@@ -7,10 +7,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from tests.chromium import CHROMIUM, Page, chromium
 from tests.conftest import Cosim
+from tests.report.blind import BEND
 
 pytestmark = [
     pytest.mark.engine,
@@ -50,6 +52,29 @@ def page(report: Path, browser: Page) -> Iterator[Page]:
     yield browser
     assert browser.wrong == []
     assert browser.asked == []
+
+
+def test_what_is_planned_is_drawn_from_above_and_in_the_picture(page: Page) -> None:
+    """Blind answers a command, and from 1 s on waypoints: the page has these, the third is followed; both pictures show
+    them, and the legend says which of both it is."""
+    drawn = "[...document.querySelectorAll('#way circle')].map((c) => [c.cx.baseVal.value, c.cy.baseVal.value])"
+    scenes = [page.js(f"JSON.parse(document.querySelector('#scene-{k}').textContent)") for k in range(2)]
+    for number, scene in enumerate(scenes):
+        page.js(f"document.querySelector('[data-entry=\"{number}\"]').click()")
+        page.until(PICTURED)
+        last, legend = scene["plans"][-1][1], page.js("document.querySelector('#key-way').textContent")
+        asked, points = np.array(last[:2]), np.array(last).reshape(-1, 2)[1:]
+        begun = scene["plans"][0][0] > 0
+        assert legend.startswith("what was commanded" if begun else "planned waypoints")
+        assert np.allclose(np.hypot(*(points - asked).T), 100.0 * np.hypot(*BEND.T), atol=1.0) and scene["follows"] == 3
+        page.key("End", code=35)
+        assert page.js("document.querySelector('#key-way').textContent").startswith("planned waypoints")
+        circles, way = np.array(page.js(drawn)), scene["pictures"]["ways"][-1]
+        assert circles.ravel().tolist() == way["points"] and len(circles) >= 6
+        assert page.js("document.querySelectorAll('#way circle.followed').length") == 1
+        assert page.js("document.querySelectorAll('#way path').length") == 2 * bool(way["lines"]) == 2
+        page.key("Escape", code=27)
+    assert any(scene["plans"][0][0] > 0 for scene in scenes)
 
 
 def test_every_failure_plays_to_its_end(page: Page) -> None:

@@ -19,6 +19,7 @@ from cosim.episode.log import Log
 from cosim.spec.scenario import Suite
 from scenarios.checks import small_scenario
 from tests.conftest import Cosim
+from tests.report.blind import BEND, Blind
 
 
 @pytest.mark.parametrize(
@@ -63,12 +64,12 @@ class Tape:
 
 @pytest.mark.engine
 def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Cosim) -> None:
-    """Read back: each tick's pose, people, velocities and plots, each picture with depth and labels; and the ground.
-    A record that was changed leaves no file."""
+    """Read back: each tick's pose, people, velocities and plots, each picture with depth and labels; waypoints
+    from where the robot was when it was asked; and the ground. A record that was changed leaves no file."""
     pytest.importorskip("rerun")
     scenario = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
-    product.run(suite, product.load_policy("straight"), out=tmp_path / "run")
+    product.run(suite, Blind(), out=tmp_path / "run")
     said = cosim("show", "run", "--episode", scenario.id, "--rerun", "e.rrd", cwd=tmp_path)
     assert said.returncode == 0, said.stderr
     tape, log = Tape(tmp_path / "e.rrd"), Log.load(tmp_path / "run" / "episodes" / scenario.id / "trajectory.npz")
@@ -83,6 +84,11 @@ def test_a_recording_holds_the_episode_on_one_timeline(tmp_path: Path, cosim: Co
     at = np.array([place for (place,) in tape.column("/world/robot", "Transform3D:translation")])
     assert np.allclose(at[:, :2], log.pose[:, :2], atol=1e-3)
     assert tape.column("/world/robot", "tick") == [*range(1, len(log) + 1)]
+    dots = [np.array(one)[:, :2] for one in tape.column("/world/waypoints/points", "Points3D:positions")]
+    for dot, (x_m, y_m, heading_rad) in zip(dots, log.pose[19:39:4], strict=True):  # at the end of the tick before
+        cos, sin = np.cos(heading_rad), np.sin(heading_rad)
+        assert np.allclose(dot, BEND @ [[cos, sin], [-sin, cos]] + (x_m, y_m), atol=1e-3)
+    assert tape.column("/world/waypoints/points", "tick") == [21, 25, 29, 33, 37]
     speeds = [speed for (speed,) in tape.column("/plots/speed/robot", "Scalars:scalars")]
     assert np.array_equal(speeds, log.speed[:, 0])
     people = tape.column("/world/people", "Capsules3D:translations")

@@ -16,9 +16,11 @@ from cosim.records.run_folder import read_spec
 from cosim.spec.goal import ImageGoal, PointGoal
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import Scenario, Suite
+from physics.cameras.view import robot_shot
 from scenarios.checks import small_scenario
 from scenarios.execution.episode import Episode
 from scenarios.execution.suite_run import run
+from scenarios.viewing.drawn_way import way_in_picture
 from tests.reachable import leaks
 
 pytestmark = pytest.mark.engine
@@ -114,11 +116,14 @@ def test_a_run_keeps_to_its_goals(scenario: Scenario, tmp_path: Path) -> None:
 
 
 def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
-    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level ground."""
+    """By depth and matrix every pixel of the ground before the robot comes to lie on it, on level ground; and a point
+    of the ground that is seen there is drawn there."""
     with Episode(scenario, ALL, SEED) as episode:
         seen = episode.reset()
         z_m = episode.moment.robot.z_m
-        lean = np.array(episode._open.parts.world.surface.lean(scenario.start_pose, seen.robot.drive.span_m)[1:])  # type: ignore[attr-defined]
+        surface, robot = episode._open.parts.world.surface, episode.moment.robot  # type: ignore[attr-defined]
+        lean = np.array(surface.lean(scenario.start_pose, seen.robot.drive.span_m)[1:])
+        shot = robot_shot(surface, seen.robot, SPEC, robot)
     assert seen.camera is not None and seen.depth is not None and seen.labels is not None
     assert np.abs(lean).max() < 0.01, "a start on a slope tells nothing here"
     rows, columns = np.nonzero((seen.labels == 2) & (seen.depth < 8.0))
@@ -126,3 +131,8 @@ def test_the_calibration_is_that_of_the_picture(scenario: Scenario) -> None:
     points = seen.camera.on_robot @ np.vstack([rays * seen.depth[rows, columns], np.ones_like(rows)])
     assert len(rows) > 50 and abs(z_m) < 1.0
     assert np.abs(np.median(points[2])) < 0.03 and np.percentile(np.abs(points[2]), 90) < 0.06
+    cos, sin = np.cos(robot.pose.heading_rad), np.sin(robot.pose.heading_rad)
+    there = points[:2].T @ [[cos, sin], [-sin, cos]] + robot.pose.xy
+    drawn = way_in_picture(shot, SPEC.lens, np.column_stack([there, surface.heights(there)])).points
+    off_px = np.hypot(*(drawn - np.column_stack([columns, rows]) - 0.5).T)
+    assert np.median(off_px) < 0.3 and np.percentile(off_px, 90) < 1.0

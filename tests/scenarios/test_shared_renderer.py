@@ -21,6 +21,7 @@ from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
 from cosim.episode.driver import Driver
+from cosim.episode.log import Log
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies.load import load_policy
 from cosim.records.run_folder import read_records, read_spec
@@ -313,13 +314,15 @@ def test_a_run_is_the_same_with_a_shared_renderer_that_asks_the_policy(
 @pytest.mark.engine
 def test_a_policy_asked_by_the_shared_renderer_is_given_the_same(tmp_path: Path) -> None:
     """Goals that are pictures, labels, odometry and calibration: it drives by them to the same state hash as where it
-    has a camera of its own."""
+    has a camera of its own, by the same waypoints."""
     guided, one = f"{OF}:Guided", EpisodeOptions(seed=7)
     suite_run.run(suite_of("a"), guided, out=tmp_path / "own", options=one)
     suite_run.run(suite_of("a"), guided, shared_renderer=True, out=tmp_path / "shared", options=one)
     (own,), (shared,) = read_records(tmp_path / "own"), read_records(tmp_path / "shared")
     assert (own.status, own.goal_protocol, own.odometry) == ("done", "image", "wheel")
     assert own.state_hash == shared.state_hash and shared.status == "done"
+    mine, theirs = ((tmp_path / how / "episodes/a/trajectory.npz") for how in ("own", "shared"))
+    assert mine.read_bytes() == theirs.read_bytes() and {*Log.load(mine).plan_sizes.tolist()} == {0, 4}
 
 
 @pytest.mark.engine

@@ -90,7 +90,33 @@
       picture.closest("figure").hidden = !list.length;
       if (list.length && picture.src !== list[k]) picture.src = list[k];
     }
+    drawWay(k);
     draw();
+  }
+  // The waypoints that are followed at this moment: x, y, x, y ..., the first where the robot was asked; or nothing
+  function planned() {
+    let plan = [];
+    for (const [from, points] of scene.plans) if (from <= sample) plan = points;
+    return plan;
+  }
+  // In the robot's picture, which is as wide as it can be, or covers its place
+  function drawWay(k) {
+    const { ways, size: [wide, high] } = scene.pictures, way = one("#way");
+    one("#key-way").textContent = planned().length ? "planned waypoints, the full one is followed" : "what was commanded, 1.5 s on";
+    way.innerHTML = "";
+    if (!ways.length || scene.pictures.at[k] > sample) return;
+    way.setAttribute("viewBox", `0 0 ${10 * wide} ${10 * high}`);
+    way.setAttribute("preserveAspectRatio", getComputedStyle(one("#by-robot")).objectFit === "cover" ? "xMidYMid slice" : "xMidYMid meet");
+    const add = (name, attributes) => {
+      const part = document.createElementNS("http://www.w3.org/2000/svg", name);
+      for (const [key, value] of Object.entries(attributes)) part.setAttribute(key, value);
+      way.append(part);
+    };
+    const { lines, points, follows } = ways[k], d = lines.map((points) => `M${points.join(" ")}`).join("");
+    if (d) for (const edge of ["edge", ""]) add("path", { d, class: edge });
+    for (let i = 0; 2 * i < points.length; i += 1) {
+      add("circle", { cx: points[2 * i], cy: points[2 * i + 1], r: wide * (i === follows ? 0.2 : 0.12), class: i === follows ? "followed" : "" });
+    }
   }
 
   // From above: the robot's heading at the end is up, so that left is left
@@ -173,18 +199,23 @@
       if (doing && doing !== "walk" && doing !== "stand") { const [px, py] = at(x, y); words(c, doing, px, py - 46 * view.scale - 6, "center"); }
     });
     const [x, y, h, , v, w] = scene.robot.slice(6 * sample, 6 * sample + 6);
-    const ahead = [];
+    const plan = planned(), ahead = [...plan];
     let ax = x, ay = y, ah = h / 1000;
-    for (let k = 0; k <= 15; k += 1) { ahead.push(ax, ay); ax += 0.1 * v * Math.cos(ah); ay += 0.1 * v * Math.sin(ah); ah += 0.1 * w / 1000; }
+    for (let k = 0; k <= 15 && !plan.length; k += 1) { ahead.push(ax, ay); ax += 0.1 * v * Math.cos(ah); ay += 0.1 * v * Math.sin(ah); ah += 0.1 * w / 1000; }
     line(c, ahead, "#0fa3b1", 8);
     box(c, x, y, h / 1000, scene.size[0] + 24, scene.size[1] + 24, "#fff");
     box(c, x, y, h / 1000, scene.size[0], scene.size[1], "#14181d");
     const nose = scene.size[0] * 0.32;
     box(c, x + nose * Math.cos(h / 1000), y + nose * Math.sin(h / 1000), h / 1000, scene.size[0] * 0.18, scene.size[1] * 0.7, "#5ac8ff");
+    for (let k = 1; 2 * k < plan.length; k += 1) {
+      const [px, py] = at(plan[2 * k], plan[2 * k + 1]), full = k === scene.follows;
+      c.beginPath(); c.arc(px, py, (full ? 14 : 9) * view.scale, 0, 7); c.lineWidth = 2;
+      c.fillStyle = full ? "#0fa3b1" : "#fff"; c.strokeStyle = full ? "#fff" : "#0fa3b1"; c.fill(); c.stroke();
+    }
     const metres = view.scale * canvas.width > 0 && canvas.width / view.scale > 1600 ? 5 : 2, long = metres * 100 * view.scale;
     c.fillStyle = "#14181d"; c.fillRect(20, canvas.height - 24, long, 4);
     words(c, `${metres} m`, 20, canvas.height - 34, "left");
-    words(c, `${(scene.robot[6 * sample + 3] / 100).toFixed(1)} m/s`, canvas.width - 20, canvas.height - 22, "right");
+    words(c, `${(Math.round(scene.robot[6 * sample + 3] / 10) / 10 || 0).toFixed(1)} m/s`, canvas.width - 20, canvas.height - 22, "right");
   }
   function words(c, text, x, y, align) {
     c.font = `600 ${Math.round(canvas.width / 42)}px ${getComputedStyle(document.body).fontFamily}`;

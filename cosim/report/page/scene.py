@@ -27,12 +27,24 @@ class CrossingLight(msgspec.Struct, frozen=True):
     states: str
 
 
+class DrawnWay(msgspec.Struct, frozen=True):
+    """The way ahead in a picture, in tenths of its pixels from its upper left corner: pieces of a line; of waypoints
+    those that are in the picture; the number of the followed one among these, -1 if it is not."""
+
+    lines: list[Outline]
+    points: Outline = []
+    follows: int = -1
+
+
 class Pictures(msgspec.Struct, frozen=True):
-    """Frames as data URLs, and the samples at which they were taken."""
+    """Frames as data URLs, and the samples at which they were taken. ways: that of each of the robot's; size: theirs,
+    width and height in pixels."""
 
     at: list[int]
     robot: list[str]
     follow: list[str]
+    ways: list[DrawnWay]
+    size: tuple[int, int]
 
 
 class Scene(msgspec.Struct, frozen=True):
@@ -40,6 +52,8 @@ class Scene(msgspec.Struct, frozen=True):
 
     robot: x, y (cm), heading (mrad), speed (cm/s), command (cm/s, mrad/s) for each sample. ground: pairs of what it is
     and its rings, drawn in turn. hit: the number of the track that the robot met, -1 for none. size: of the robot, cm.
+    plans: (sample, outline) where the waypoints change that are followed: where the robot was when it was asked, and
+    these; empty where there are none. follows: which point of an outline is followed.
     """
 
     step_s: float
@@ -53,6 +67,8 @@ class Scene(msgspec.Struct, frozen=True):
     goal: tuple[int, int]
     pictures: Pictures
     hit: int = -1
+    plans: list[tuple[int, Outline]] = []
+    follows: int = 0
 
 
 class Entry(msgspec.Struct, frozen=True, kw_only=True):
