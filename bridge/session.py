@@ -19,6 +19,7 @@ from typing import Any, Self
 
 import zenoh
 
+from bridge.security.rights import access_of
 from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
 
@@ -221,16 +222,22 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
     ...         one.ask("cosim/r/status", b"well?", timeout_s=60.0)
     b'WELL?'
     """
-    if connection.warning:
-        say(connection.warning)
-    more: dict[str, object] = {}
+    for line in notices_of(connection):
+        say(line)
+    more: dict[str, object] = {"transport/link/tls": _tls(Path(connection.tls))} if connection.tls else {}
+    if connection.listen:
+        more |= access_of(connection)
+    return _listening(connection, more) if connection.listen else _connected(connection, more)
+
+
+def notices_of(connection: Connection) -> list[str]:
+    """What is insecure about a connection, and which certificate ends soon, a line each. Raises AccessError."""
+    soon = ""
     if connection.tls:
         from bridge.security.identity import checked_identity
 
-        if soon := checked_identity(connection):
-            say(soon)
-        more["transport/link/tls"] = _tls(Path(connection.tls))
-    return _listening(connection, more) if connection.listen else _connected(connection, more)
+        soon = checked_identity(connection)
+    return [line for line in (connection.warning, soon) if line]
 
 
 def _tls(folder: Path) -> dict[str, object]:
@@ -262,7 +269,7 @@ def _listening(connection: Connection, more: Mapping[str, object]) -> Session:
 
 
 def _connected(connection: Connection, more: Mapping[str, object]) -> Session:
-    remedy = "Is a process started that listens there, and is the endpoint the same?"
+    remedy = "Is a process started that listens there, by the same protocol and port?"
     try:
         return Session(
             _open("client", [], [connection.connect], f"no hub answers at {connection.connect}", remedy, more)

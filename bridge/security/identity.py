@@ -90,6 +90,12 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
     return f"{folder} expires on {said(found.ends)}: {renew}." if found.ends - now < SOON else ""
 
 
+def time_left(identity: Identity) -> str:
+    """Until when it is valid, and how long that is."""
+    days = (identity.ends - datetime.now(UTC)).days
+    return f"{identity.ends:%Y-%m-%d} ({f'{days} days' if days >= 0 else 'expired'})"
+
+
 def said(moment: datetime) -> str:
     """A moment as it is printed."""
     return f"{moment:%Y-%m-%d %H:%M} UTC"

@@ -10,9 +10,10 @@ from rich.markup import escape
 
 from cosim.cli.bench.bench import bench_app
 from cosim.cli.installation.verify import installation_app
+from cosim.cli.network.certs import certs_app
 from cosim.cli.network.direct import direct_app
 from cosim.cli.network.live import live_app
-from cosim.cli.options.panels import MEASURE, PLACES
+from cosim.cli.options.panels import MEASURE, PLACES, STEP_IN
 from cosim.cli.pictures.export import export_app
 from cosim.cli.pictures.film import film_app
 from cosim.cli.pictures.look import look_app
@@ -48,6 +49,7 @@ for commands in (
     *(bench_app, score_app, compare_app),
 ):
     app.add_typer(commands)
+app.add_typer(certs_app, name="certs", rich_help_panel=STEP_IN)
 app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
 app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)

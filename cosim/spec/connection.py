@@ -44,7 +44,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError("one end of a session listens or connects: name one endpoint")
         if self.listen and self.role not in HUBS:
             raise UsageError(f"a {self.role} listens nowhere, it connects. Those who listen: {', '.join(HUBS)}.")
-        protocol, address = _parts(_well_formed(self.endpoint))
+        protocol, address = _parts(checked_endpoint(self.endpoint, "endpoint"))
         if self.tls and self.insecure:
             raise UsageError("--tls guards and --insecure does not: choose one")
         if self.tls and protocol != "tls":
@@ -88,11 +88,12 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         return f"whoever can reach {self.listen} may {may[self.role]}, and read all that is sent"
 
 
-def _well_formed(endpoint: str) -> str:
+def checked_endpoint(endpoint: str, option: str) -> str:
+    """The endpoint that an option was given. Raises UsageError where it can be none."""
     found = _OVER_IP.fullmatch(endpoint)
     if not (found and 1 <= int(found[3]) <= 65535) and not _OVER_A_FILE.fullmatch(endpoint):
         like = "tcp/127.0.0.1:7447, tls/HOST:7447 or unixsock-stream/PATH"
-        raise UsageError(f"endpoint '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
+        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
     return endpoint
 
 

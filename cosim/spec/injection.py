@@ -13,6 +13,7 @@ import msgspec
 
 from cosim.core.errors import SpecError
 from cosim.core.state import Doing
+from cosim.spec.connection import Connection
 
 _FASTEST_MPS = 3.0
 LONGEST_S = 3600.0
@@ -66,7 +67,7 @@ class Ack(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Live(msgspec.Struct, frozen=True, kw_only=True):
-    """Where a run is on the air. endpoint: of its hub, such as tcp/127.0.0.1:7447; run: its name in the keys."""
+    """Where a run is on the air. connection: to its hub; run: its name in the keys."""
 
-    endpoint: str
+    connection: Connection
     run: str

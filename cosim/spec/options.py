@@ -8,6 +8,7 @@ from typing import Literal
 import msgspec
 
 from cosim.core.errors import UsageError
+from cosim.spec.connection import Connection
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
 from cosim.spec.pseudonym import check_seed
@@ -18,10 +19,10 @@ MOST_LATENCY_MS = 10_000.0
 
 
 class Outside(msgspec.Struct, frozen=True, kw_only=True):
-    """A director in a process of its own. endpoint: where it listens; run: the run's name in the keys; wait_s: how long
-    an episode waits for it before it is recorded as crashed."""
+    """A director in a process of its own. connection: to it; run: the run's name in the keys; wait_s: how long an
+    episode waits for it before it is recorded as crashed."""
 
-    endpoint: str
+    connection: Connection
     run: str
     wait_s: float
 

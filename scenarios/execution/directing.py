@@ -22,8 +22,8 @@ import msgspec
 import scenarios.events
 from bridge import keys
 from bridge.director import RemoteDirector, Waiting, serve_director
-from bridge.session import LoneSession, Session
-from cosim.core.errors import DirectorLost, EngineError
+from bridge.session import LoneSession, Session, open_session
+from cosim.core.errors import AccessError, DirectorLost, EngineError
 from cosim.core.state import DIRECTED, People
 from cosim.episode.ports import Director
 from cosim.people.standing import Standing
@@ -122,18 +122,20 @@ def _gather(name: str, found: dict[str, bytes]) -> None:
 
 def _reached(outside: Outside, waiting: Waiting) -> Session:
     """A session with the director's hub, as soon as there is one."""
-    deadline = time.monotonic() + outside.wait_s
+    deadline, endpoint = time.monotonic() + outside.wait_s, outside.connection.endpoint
     told = False
     while True:
         try:
-            return Session.client(outside.endpoint)
+            return open_session(outside.connection)
+        except AccessError as error:
+            raise DirectorLost(str(error)) from error
         except EngineError as error:
             if time.monotonic() > deadline:
                 raise DirectorLost(
-                    f"no director at {outside.endpoint} within {outside.wait_s:g} s: start one with `cosim direct "
-                    f"--listen {outside.endpoint}` ({error})"
+                    f"no director at {endpoint} within {outside.wait_s:g} s: start one with `cosim direct "
+                    f"--listen {endpoint}` ({error})"
                 ) from error
         if not told:
-            waiting(f"waits for a director at {outside.endpoint}, {outside.wait_s:g} s at most")
+            waiting(f"waits for a director at {endpoint}, {outside.wait_s:g} s at most")
             told = True
         time.sleep(RETRY_S)

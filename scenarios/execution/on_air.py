@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bridge import keys
 from bridge.live import serve_injections
-from bridge.session import Session
+from bridge.session import open_session
 from cosim.core.clock import Clock
 from cosim.core.state import Age, PersonKind
 from cosim.episode.step import Step
@@ -42,7 +42,7 @@ class OnAir:
         self._rgb: NDArray[np.uint8] | None = None
 
     def __enter__(self) -> Self:
-        self._session = Session.client(self._live.endpoint)
+        self._session = open_session(self._live.connection)
         serve_injections(self._session, f"{self._below}/inject", self._injected.offer)
         self._session.serve(f"{self._below}/status", lambda _: self._status(), found=True)
         self._session.serve(f"{self._below}/log", lambda _: self._log())

@@ -18,6 +18,7 @@ from cosim.cli.options.endpoint import LONGEST_WAIT_S
 from cosim.episode.control import Command
 from cosim.episode.ports import Manifest, Observation
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite
 from scenarios.events import EVENT_KINDS
 from tests.conftest import PATIENCE_S, Cosim
@@ -217,6 +218,7 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
     from scenarios.execution.directing import directed_by
 
     at = f"unixsock-stream/{tmp_path}/director.sock"
+    there = Connection(role="coordinator", connect=at)
     query = EventQuery(
         episode="e", tick=0, tick_ms=50, robot_x_m=0.0, robot_y_m=0.0, robot_heading_rad=0.0, robot_v_mps=0.0,
         robot_w_radps=0.0, route_s_m=0.0, robot_length_m=0.7, robot_width_m=0.55, events=(),
@@ -226,14 +228,14 @@ def test_a_run_waits_for_a_director_that_is_started_after_it(tmp_path: Path, cos
         pytest.raises(
             DirectorLost, match=r"no director at .*director\.sock within 0\.5 s: start one with `cosim direct"
         ),
-        directed_by(Outside(endpoint=at, run="r", wait_s=0.5), told.append, "e"),
+        directed_by(Outside(connection=there, run="r", wait_s=0.5), told.append, "e"),
     ):
         pass
     directors: list[subprocess.Popen[str]] = []
     late = threading.Thread(target=lambda: directors.append(started(tmp_path, *WORDS, "direct", "--listen", at)))
     late.start()
     try:
-        with directed_by(Outside(endpoint=at, run="r", wait_s=PATIENCE_S), told.append, "e") as director:
+        with directed_by(Outside(connection=there, run="r", wait_s=PATIENCE_S), told.append, "e") as director:
             assert director.react(query).tick == 0
         late.join()
         second = cosim("direct", "--listen", at)

@@ -14,8 +14,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from cosim.cli.app import app
-from cosim.cli.options.endpoint import checked_endpoint
 from cosim.core.errors import UsageError
+from cosim.spec.connection import checked_endpoint
 from tests.conftest import PATIENCE_S
 
 FIRST = ("run", "list", "show", "doctor")
@@ -127,7 +127,7 @@ def test_an_endpoint_that_can_be_none_is_refused_with_an_example(endpoint: str) 
         checked_endpoint(endpoint, "--connect")
 
 
-@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "udp/host:65535", "unixsock-stream//tmp/a"])
+@pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:7447", "tcp/[::1]:1", "tls/host:65535", "unixsock-stream//tmp/a"])
 def test_an_endpoint_that_may_be_one_is_taken(endpoint: str) -> None:
     """Names, addresses of both kinds, sockets in the file system."""
     assert checked_endpoint(endpoint, "--connect") == endpoint

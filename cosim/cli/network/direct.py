@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options.endpoint import DIRECTOR, checked_endpoint
+from cosim.cli.options.endpoint import DIRECTOR, Insecure, Tls, listening, warned
 from cosim.cli.options.panels import STEP_IN
 from cosim.core.errors import INTERRUPTED
 
@@ -21,16 +21,18 @@ direct_app = typer.Typer()
 )
 def direct(
     listen: Annotated[str, typer.Option(help="Where runs find it.")] = DIRECTOR,
+    tls: Tls = "",
+    insecure: Insecure = False,
 ) -> None:
     """Direct the event pedestrians of runs that were started with --director, until stopped.
 
     It keeps nothing: stop it, kill it and start it again in the middle of an episode, and the episode waits, goes on
     and comes to the same state hash. A run of other code is refused.
     """
-    from bridge.session import Session
+    from bridge.session import open_session
     from scenarios.execution.directing import behaviours, serve
 
-    with Session.hub(checked_endpoint(listen, "--listen")) as session:
+    with open_session(listening("director", "--listen", listen, tls, insecure), warned) as session:
         serve(session)
         print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
         try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 from contextlib import nullcontext, suppress
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -11,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from cosim.cli.options.endpoint import DEFAULT, checked_endpoint
+from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, warned
 from cosim.cli.options.panels import STEP_IN
 from cosim.cli.terminal.consoles import err, out
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, WRONG_USE, CosimError, EngineError, UsageError, unknown
+from cosim.spec.connection import Connection
 
 if TYPE_CHECKING:
     from bridge.session import Session
@@ -43,12 +45,14 @@ def inject(
     connect: Connect = DEFAULT,
     env: Env = None,
     wait: Wait = 0.0,
+    tls: Tls = "",
+    insecure: Insecure = False,
 ) -> None:
     """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 2: refused."""
     from bridge.live import send_injection as send
 
     payload = _payload(message)
-    session, below = found(connect, env, wait)
+    session, below = _found(connecting("injector", "--connect", connect, tls, insecure), env, wait)
     with session:
         ack = send(session, f"{below}/inject", payload)
     if ack.status == "refused":
@@ -65,13 +69,15 @@ def listen(
     connect: Connect = DEFAULT,
     env: Env = None,
     wait: Wait = 0.0,
+    tls: Tls = "",
+    insecure: Insecure = False,
     seconds: Annotated[float | None, typer.Option(min=0.0, max=1e6, help="How long; by default until stopped.")] = None,
 ) -> None:
     """Print what a running episode tells: a line of JSON each time. For `events` what happened before comes first."""
     topics = ("clock", "robot", "crowd", "signals", "events")
     if topic not in topics:
         raise unknown("topic", topic, topics)
-    session, below = found(connect, env, wait)
+    session, below = _found(connecting("viewer", "--connect", connect, tls, insecure), env, wait)
     with session:
         if topic == "events":
             print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
@@ -97,14 +103,13 @@ def _payload(message: str) -> bytes:
     return message.encode()
 
 
-def found(connect: str, env: str | None, wait_s: float) -> tuple[Session, str]:
-    """A session at an endpoint, to be closed, and what the keys of the episode that is meant begin with.
+def _found(connection: Connection, env: str | None, wait_s: float) -> tuple[Session, str]:
+    """A session, to be closed, and what the keys of the episode that is meant begin with.
 
     Looks for it until `wait_s` seconds are over, and says so. Raises EngineError when nothing is on the air then,
     UsageError when only others are, or when several are and none is named.
     """
-    checked_endpoint(connect, "--connect")
-    meant = _meant(connect, env)
+    meant, connect = _meant(connection, env, warned), connection.connect
     if isinstance(meant, tuple):
         return meant
     began = time.monotonic()
@@ -115,18 +120,21 @@ def found(connect: str, env: str | None, wait_s: float) -> tuple[Session, str]:
                 remedy = f"waited {wait_s:g} s" if wait_s else "--wait 60 waits until it is there"
                 raise type(meant)(f"{meant} ({remedy})")
             time.sleep(min(PAUSE_S, left_s))
-            meant = _meant(connect, env)
+            meant = _meant(connection, env)
     err.print(f"{_name(meant[1])} is on the air after {time.monotonic() - began:.0f} s.", highlight=False)
     return meant
 
 
-def _meant(connect: str, env: str | None) -> tuple[Session, str] | CosimError:
+def _meant(
+    connection: Connection, env: str | None, say: Callable[[str], None] = lambda _: None
+) -> tuple[Session, str] | CosimError:
     """An open session and the episode, or why there is none yet. Raises UsageError where waiting changes nothing."""
     from bridge import keys
-    from bridge.session import Session
+    from bridge.session import open_session
 
+    connect = connection.connect
     try:
-        session = Session.client(connect)
+        session = open_session(connection, say)
     except EngineError:
         return EngineError(f"no run is on the air at {connect}: start one with `cosim run ... --live {connect}`")
     statuses = session.answers(keys.EVERY_STATUS, timeout_s=SEARCH_S)

@@ -1,10 +1,14 @@
-"""Where something is to be found on the network, and how long to wait for it."""
+"""Where something is to be found on the network, what guards it, and how long to wait for it."""
 
 from __future__ import annotations
 
-import re
+from typing import Annotated
 
+import typer
+
+from cosim.cli.terminal.consoles import err
 from cosim.core.errors import UsageError
+from cosim.spec.connection import Connection, Role, checked_endpoint
 
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
@@ -12,11 +16,39 @@ LONGEST_WAIT_S = 240.0
 """For a director: an environment process that says nothing for much longer is taken to hang
 (`scenarios.execution.pool`)."""
 
+Tls = Annotated[str, typer.Option("--tls", metavar="FOLDER", help="Guard tls/... endpoints: see `cosim certs --help`.")]
+Insecure = Annotated[
+    bool, typer.Option("--insecure", help="Beyond this machine without TLS: open to all who can reach it, unencrypted.")
+]
 
-def checked_endpoint(endpoint: str, option: str) -> str:
-    """An endpoint of an option, as zenoh writes it. Raises UsageError."""
-    like = DEFAULT if option in ("--live", "--connect") else DIRECTOR
-    over_ip = re.fullmatch(r"(?:tcp|tls|udp|quic)/[^/]+:(\d{1,5})(?:[?#].*)?", endpoint)
-    if not (over_ip and 1 <= int(over_ip.group(1)) <= 65535) and not re.fullmatch(r"unixsock-stream/.+", endpoint):
-        raise UsageError(f"{option} '{endpoint}': write it as PROTOCOL/ADDRESS:PORT, like {like}")
-    return endpoint
+
+def listening(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
+    """The end that listens at the endpoint of an option. Raises UsageError."""
+    return Connection(role=role, listen=checked_endpoint(endpoint, option), tls=tls, insecure=insecure)
+
+
+def connecting(role: Role, option: str, endpoint: str, tls: str, insecure: bool) -> Connection:
+    """The end that connects to the endpoint of an option. Raises UsageError."""
+    return Connection(role=role, connect=checked_endpoint(endpoint, option), tls=tls, insecure=insecure)
+
+
+def ends_of_run(
+    live: str | None, director: str | None, tls: str, insecure: bool
+) -> tuple[Connection | None, Connection | None]:
+    """Where a run listens and where its director is: --tls goes to those that are tls/... Raises UsageError."""
+    given = {name: end for name, end in (("--live", live), ("--director", director)) if end is not None}
+    if not given and (tls or insecure):
+        raise UsageError(f"{'--tls' if tls else '--insecure'} goes with --live or --director")
+    guarded = [name for name, end in given.items() if end.startswith("tls/")]
+    if tls and not guarded:
+        raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {', '.join(given.values())}")
+    files = {name: tls if name in guarded else "" for name in given}
+    return (
+        None if live is None else listening("coordinator", "--live", live, files["--live"], insecure),
+        None if director is None else connecting("coordinator", "--director", director, files["--director"], insecure),
+    )
+
+
+def warned(line: str) -> None:
+    """Print what is insecure, or ends soon, on standard error."""
+    err.print(line, soft_wrap=True, markup=False, highlight=False)

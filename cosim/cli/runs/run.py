@@ -9,10 +9,11 @@ from datetime import datetime
 from pathlib import Path
 from typing import Annotated, get_args
 
+import msgspec
 import typer
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
-from cosim.cli.options.endpoint import LONGEST_WAIT_S, checked_endpoint
+from cosim.cli.options.endpoint import LONGEST_WAIT_S, Insecure, Tls, ends_of_run, warned
 from cosim.cli.options.latency import LATENCY_HELP, REAL_TIME_HELP, with_latency
 from cosim.cli.options.recording import RERUN_HELP, check_rerun, write_rerun
 from cosim.cli.options.street import (
@@ -94,6 +95,8 @@ def run_command(
     director: Annotated[
         str | None, typer.Option(help="Ask the director at this endpoint, a process of its own: see `cosim direct`.")
     ] = None,
+    tls: Tls = "",
+    insecure: Insecure = False,
     director_wait: Annotated[
         float, typer.Option(min=0.1, max=LONGEST_WAIT_S, help="Seconds to wait for it; then the episode has crashed.")
     ] = 60.0,
@@ -110,7 +113,7 @@ def run_command(
 ) -> None:
     """Run a suite with a policy and print its table."""
     from bridge import keys
-    from bridge.session import Session
+    from bridge.session import notices_of, open_session
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
     from cosim.policies.load import load_policy
     from cosim.records.run_folder import RunFolder
@@ -129,6 +132,9 @@ def run_command(
     from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
     from scenarios.rendering.shared import SharedRenderer, check_shared
 
+    air, away = ends_of_run(live, director, tls, insecure)
+    for line in [] if away is None else notices_of(away):
+        warned(line)
     if map_name is not None:
         from scenarios.builders.sample import suite_on_map
 
@@ -160,11 +166,9 @@ def run_command(
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
     with doing(LOOKING) as tell:
         check_places(whole, picked, tell)
-    on_air = None if live is None else Live(endpoint=checked_endpoint(live, "--live"), run=keys.chunk(path.name))
-    outside = None
-    if director is not None:
-        endpoint = checked_endpoint(director, "--director")
-        outside = Outside(endpoint=endpoint, run=keys.chunk(path.name), wait_s=director_wait)
+    named = keys.chunk(path.name)
+    on_air = None if air is None else Live(connection=air, run=named)
+    outside = None if away is None else Outside(connection=away, run=named, wait_s=director_wait)
     options = EpisodeOptions(
         seed=run_seed,
         robot=robot,
@@ -183,8 +187,9 @@ def run_command(
     spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:
         if on_air is not None:
-            stack.enter_context(Session.hub(on_air.endpoint))
-            err.print(f"On the air at {on_air.endpoint}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
+            hub = stack.enter_context(open_session(on_air.connection, warned))
+            options = msgspec.structs.replace(options, live=Live(connection=hub.inside, run=named))
+            err.print(f"On the air at {live}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
         held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
         stack.enter_context(held)
         err.print(

@@ -1,0 +1,194 @@
+"""Certificates: made once, kept to oneself, shown with their end, and refused in words when they do not fit."""
+
+from __future__ import annotations
+
+import shutil
+import stat
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pytest
+import zenoh
+
+from bridge.security.authority import issue, make_authority
+from bridge.security.identity import checked_identity, identity_in
+from bridge.session import open_session
+from cosim.core.errors import AccessError, EngineError, UsageError
+from cosim.spec.connection import Connection, Role
+from tests.bridge.security.plain import free_port, plain_zenoh
+from tests.conftest import Cosim
+
+NOW = datetime.now(UTC)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An authority with a coordinator of localhost and a worker."""
+    folder = tmp_path_factory.mktemp("authority") / "certs"
+    make_authority(folder, ["localhost"], 365)
+    issue(folder, "worker", [], 365)
+    return folder
+
+
+def end_of(folder: Path, role: Role) -> Connection:
+    """An end of a session with what is in a folder, that nobody need be at."""
+    end = "listen" if role == "coordinator" else "connect"
+    return Connection(role=role, tls=str(folder / role), **{end: "tls/localhost:7447"})  # type: ignore[arg-type]
+
+
+def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cosim) -> None:
+    """Keys are their owner's alone; what is there stays until --renew, which keeps the hosts; the end is shown."""
+    folder = tmp_path / "certs"
+    first = cosim("certs", "init", str(folder), "--host", "hub.lan", "--host", "10.0.0.7", "--days", "90")
+    assert first.returncode == 0 and "reached by hub.lan, 10.0.0.7" in first.stdout, first.stderr
+    assert cosim("certs", "role", str(folder), "viewer").returncode == 0
+    for key in (folder / "ca.key", folder / "coordinator" / "key.pem", folder / "viewer" / "key.pem"):
+        assert stat.S_IMODE(key.stat().st_mode) == 0o600
+    before = (folder / "coordinator" / "cert.pem").read_bytes()
+    for words, said in {
+        ("init", str(folder)): "is not empty",
+        ("role", str(folder), "coordinator"): "--renew replaces it",
+        ("role", str(folder), "guest"): "Valid choices: coordinator, director",
+        ("role", str(folder), "director"): "--host NAME",
+        ("role", str(folder), "worker", "--host", "a b"): "a name or address of a machine",
+        ("role", str(folder), "worker", "--host", "w.lan"): "nobody connects to a worker",
+        ("role", str(tmp_path / "none"), "worker"): "holds no authority",
+        ("show", str(tmp_path)): "holds no certificate",
+    }.items():
+        refused = cosim("certs", *words)
+        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+    assert (folder / "coordinator" / "cert.pem").read_bytes() == before
+    assert cosim("certs", "role", str(folder), "coordinator", "--renew").returncode == 0
+    assert (folder / "coordinator" / "cert.pem").read_bytes() != before
+    shown = cosim("certs", "show", str(folder)).stdout
+    assert "hub.lan, 10.0.0.7" in shown and "watch" in shown and f"{NOW + timedelta(days=365):%Y-%m}" in shown
+    assert sorted(path.name for path in folder.iterdir()) == ["ca.key", "ca.pem", "coordinator", "viewer"]
+
+
+def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> None:
+    """A missing file, damage, another's key, another authority, everybody's key, another role: each by its name."""
+    other = tmp_path / "other"
+    make_authority(other, ["localhost"], 365)
+    copies = iter(range(100))
+
+    def refused(change: str, role: Role = "worker") -> str:
+        folder = tmp_path / str(next(copies))
+        shutil.copytree(made, folder)
+        place = folder / "worker"
+        match change:
+            case "missing":
+                (place / "key.pem").unlink()
+            case "damaged":
+                (place / "cert.pem").write_text("-----BEGIN CERTIFICATE-----\nno\n")
+            case "no key":
+                (place / "key.pem").write_text("-----BEGIN PRIVATE KEY-----\nno\n")
+            case "another's key":
+                shutil.copy(folder / "coordinator" / "key.pem", place / "key.pem")
+            case "another authority":
+                shutil.copy(other / "ca.pem", place / "ca.pem")
+            case "everybody's key":
+                (place / "key.pem").chmod(0o644)
+        with pytest.raises(AccessError) as error:
+            checked_identity(Connection(role=role, connect="tls/localhost:1", tls=str(place)))
+        return str(error.value)
+
+    for change, words in {
+        "missing": "key.pem: cannot be read: No such file",
+        "damaged": "cert.pem: holds no certificate",
+        "no key": "key.pem: holds no private key",
+        "another's key": "key.pem is not the key of",
+        "another authority": "was not issued by",
+        "everybody's key": "chmod 600",
+    }.items():
+        assert words in refused(change), change
+    assert "is of a worker, and this needs one of a viewer" in refused("", "viewer")
+
+
+def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:
+    """Nothing is said long before; within 30 days the day and the remedy; afterwards, and too early, it is refused."""
+    for role in ("coordinator", "worker"):
+        end = end_of(made, role)  # type: ignore[arg-type]
+        assert checked_identity(end, NOW) == ""
+        assert "expires on" in (said := checked_identity(end, NOW + timedelta(days=350))) and "--renew" in said
+        with pytest.raises(AccessError, match=r"has expired on .*--renew"):
+            checked_identity(end, NOW + timedelta(days=366))
+        with pytest.raises(AccessError, match="is this machine's clock right"):
+            checked_identity(end, NOW - timedelta(days=3))
+    assert checked_identity(end_of(made, "worker"), NOW - timedelta(hours=20)) == "", "a clock that is behind"
+
+
+@pytest.mark.engine
+def test_a_hub_that_does_not_fit_is_refused_in_words(
+    made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another authority there or here, another name, an expired hub, no TLS, nobody there; and one that fits."""
+    other = tmp_path / "other"
+    make_authority(other, ["localhost"], 365)
+    issue(other, "worker", [], 365)
+    trusting = tmp_path / "trusting"  # takes the hub for what it is, and is not taken itself
+    shutil.copytree(other / "worker", trusting)
+    (trusting / "ca.pem").write_bytes((other / "ca.pem").read_bytes() + (made / "ca.pem").read_bytes())
+    old = tmp_path / "old"
+    make_authority(old, ["localhost"], 5, NOW - timedelta(days=10))
+    issue(old, "worker", [], 365)
+
+    def tried(at: str, folder: Path) -> str:
+        with pytest.raises(AccessError) as error, open_session(Connection(role="worker", connect=at, tls=str(folder))):
+            pass
+        return str(error.value)
+
+    at = f"tls/localhost:{free_port()}"
+    listening = Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))
+    with open_session(listening) as session:
+        session.serve("cosim/r/jobs/claim", bytes.upper)
+        with open_session(Connection(role="worker", connect=at, tls=str(made / "worker"))) as worker:
+            assert worker.ask("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
+        assert (
+            "the certificate of tls/localhost" in (said := tried(at, other / "worker")) and "another authority" in said
+        )
+        assert "refused us" in (said := tried(at, trusting)) and "than the one there trusts" in said
+        assert "is not for the address 127.0.0.1" in tried(at.replace("localhost", "127.0.0.1"), made / "worker")
+    plain = f"tls/localhost:{free_port()}".replace("tls", "tcp")
+    with (
+        open_session(Connection(role="coordinator", listen=plain)),
+        pytest.raises(EngineError, match="by the same protocol"),
+    ):
+        open_session(Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker")))
+    expired = Connection(role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator"))
+    with pytest.raises(AccessError, match="has expired on"):
+        open_session(expired)
+    monkeypatch.setattr("bridge.session.notices_of", lambda _: [])  # one that listened before its certificate's end
+    (trusting / "ca.pem").write_bytes((other / "ca.pem").read_bytes() + (old / "ca.pem").read_bytes())
+    with open_session(expired):
+        assert "has expired" in tried(expired.listen, trusting)
+    with pytest.raises(EngineError, match="no hub answers at"):
+        open_session(Connection(role="worker", connect=f"tls/localhost:{free_port()}", tls=str(made / "worker")))
+
+
+@pytest.mark.engine
+def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(made: Path, tmp_path: Path) -> None:
+    """None, one of another authority, one that signed itself a worker: no link; the same client with ours: a link."""
+    other = tmp_path / "other"
+    make_authority(other, ["localhost"], 365)
+    issue(other, "worker", [], 365)
+    shutil.copy(made / "ca.pem", other / "ca.pem")
+    (tmp_path / "none").mkdir()
+    shutil.copy(made / "ca.pem", tmp_path / "none" / "ca.pem")
+    at = f"tls/localhost:{free_port()}"
+    with open_session(Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))):
+        for folder in (other, tmp_path / "none"):
+            with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=1000):
+                pass
+        with pytest.raises(zenoh.ZError), plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=1000):
+            pass
+        with plain_zenoh(at, made, "worker"):
+            pass
+
+
+def test_a_host_that_is_none_is_refused(tmp_path: Path) -> None:
+    """Before anything is written."""
+    with pytest.raises(UsageError, match="a name or address of a machine"):
+        make_authority(tmp_path / "certs", ["hub lan"], 1)
+    assert not (tmp_path / "certs").exists()
+    make_authority(tmp_path / "certs", ["hub.lan", "::1"], 1)
+    assert identity_in(tmp_path / "certs" / "coordinator").hosts == ("hub.lan", "::1")
