@@ -111,19 +111,33 @@ class MachineError(CosimError):
     exit_code = BROKEN_MACHINE
 
 
-def unwritable(path: Path, error: OSError, remedy: str = "choose another place, or make room") -> MachineError:
-    """The error for a file or folder that cannot be written."""
-    return MachineError(f"{path}: cannot be written: {error.strerror or error}: {remedy}")
+def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError:
+    """The error for a file or folder that cannot be written. Where its path leads through a file, or is one and should
+    be a folder, that is the reason; and unless there is a remedy, another path is."""
+    reason = error.strerror or str(error)
+    if isinstance(error, FileExistsError | NotADirectoryError):
+        for file in (path, *path.parents):
+            if file.is_file():
+                reason = f"{file} is a file, no folder"
+                beside = f"like {file.parent / path.relative_to(file)}" if file != path else "with another name"
+                remedy = remedy or f"choose a place beside it, {beside}"
+                break
+    return MachineError(f"{path}: cannot be written: {reason}: {remedy or 'choose another place, or make room'}")
 
 
 def unknown(what: str, name: str, choices: Iterable[str]) -> UsageError:
     """The error for a `name` that is none of the `choices`, which it lists: unknown("suite", "x", ["unit"])."""
     valid = sorted(choices)
-    listed = ", ".join(valid) or "none"
-    if len(valid) > MOST_LISTED:
-        near = get_close_matches(name, valid, n=5, cutoff=0.5)
-        listed = f"{len(valid)}, among them {', '.join(sorted(near) or valid[:5])}"
-    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed}.{nearest(name, valid)}")
+    return UsageError(f"unknown {what} '{name}'. Valid choices: {listed(name, valid)}.{nearest(name, valid)}")
+
+
+def listed(name: str, choices: Iterable[str]) -> str:
+    """All choices, or of many how many there are, and those most like the name: "a, b", "312, among them a, b"."""
+    valid = sorted(choices)
+    if len(valid) <= MOST_LISTED:
+        return ", ".join(valid) or "none"
+    near = get_close_matches(name, valid, n=5, cutoff=0.5)
+    return f"{len(valid)}, among them {', '.join(sorted(near) or valid[:5])}"
 
 
 def nearest(name: str, valid: Iterable[str]) -> str:

@@ -72,6 +72,12 @@ def goal_reached(episode: EpisodeFacts) -> float:
     return float(episode.ended == "goal")
 
 
+SUCCESS_IN_WORDS = (
+    "success: the goal reached in time (of gesturing: the stop made) without a failure or a broken rule (of conversing "
+    "and queueing: pass round them)"
+)
+
+
 def success(episode: EpisodeFacts) -> float:
     """1 if the goal was reached, or the stop made that was asked for, in time, without a failure or a broken rule."""
     return float(episode.ended in ("goal", "stop") and not episode.failures and not episode.rules_broken)

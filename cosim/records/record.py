@@ -73,6 +73,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     walked_into: contacts with people who walked into the robot where it stood; no failures.
     waypoints: how those that it answers were followed. latency_ms: of its commands, as asked for; in real_time the
     median of those that were measured, and another one the next time: such a record is replayed, not made again.
+    latency_ms is counted in whole ticks; what the policy took for an answer is `answer_ms`.
     metric_schema: METRIC_SCHEMA of the version that made the measures, 0 where that did not say.
     injections: pedestrians that came in from outside; with them the episode can be replayed.
     crashed: its policy crashed, which counts as a failure. invalid: what the simulator owes, counted apart: it came to
@@ -126,6 +127,11 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     metric_schema: int = 0
     schema: int = _SCHEMA
     clock: dict[str, float] = {}
+
+    @property
+    def answer_ms(self) -> float | None:
+        """In real time the median of what the policy took for an answer, as it was measured; else None."""
+        return self.clock.get("answer_ms") if self.real_time else None
 
     def save(self, path: Path) -> None:
         """Write as JSON, whole or not at all."""

@@ -16,8 +16,8 @@ from cosim.records.record import Record
 KEYS: tuple[str, ...] = (
     "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "split",
     "structure", "crowd_added", "run_seed", "episode", "robot", "policy", "policy_version", "camera", "rate_hz",
-    "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "latency_ms", "real_time", "renderer",
-    "ticks", "state_hash",
+    "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "latency_ms", "answer_ms", "real_time",
+    "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
@@ -33,7 +33,8 @@ MOST_INVALID = 0.02
 
 
 def table_row(record: Record) -> dict[str, Any]:
-    """One flat row. A function of scenario, policy and versions alone: wall times are left out."""
+    """One flat row. A function of scenario, policy and versions alone, but in real time: other wall times are left
+    out."""
     row: dict[str, Any] = {key: getattr(record, key) for key in KEYS}
     row["waypoints"] = record.waypoints.in_words
     further = [f"{name}: {spec.in_words}" for name, spec in record.cameras.items()]

@@ -25,7 +25,7 @@ from typing import Any, Self
 import msgspec
 import pandas as pd
 
-from cosim.core.errors import MachineError, RunError, unknown, unwritable
+from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
 from cosim.core.whole_file import write_whole
 from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.records.record import Record
@@ -259,12 +259,17 @@ class RunFolder:
 
 
 def read_spec(path: Path) -> RunSpec:
-    """What the run in a folder is. Raises UsageError, with the runs beside it, when it holds none."""
+    """What the run in a folder is. Raises UsageError, with the runs in it and beside it, when it holds none."""
     try:
         return msgspec.json.decode((path / "run.json").read_bytes(), type=RunSpec)
     except FileNotFoundError:
-        beside = [p.parent.name for p in path.parent.glob("*/run.json")] if path.parent.is_dir() else []
-        raise unknown("run", str(path), beside) from None
+        near = [str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))]
+        if path.is_dir():
+            there = f"Runs in it and beside it: {listed(str(path), near)}"
+            raise UsageError(f"{path} is no run folder: it holds no run.json. {there}") from None
+        raise unknown("run", str(path), near) from None
+    except NotADirectoryError:
+        raise UsageError(f"{path} is no run folder: a file is there, and a run is a folder with run.json") from None
     except (OSError, msgspec.DecodeError) as error:
         why = error.strerror if isinstance(error, OSError) else error
         raise RunError(f"{path / 'run.json'}: cannot be read: {why}: name another run, or run it again") from error

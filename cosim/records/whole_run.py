@@ -46,13 +46,19 @@ def read_whole_run(path: Path) -> WholeRun:
                 f"{path / 'scenarios.json'}: scenario '{name}' is not the one that was run, it was edited since: put "
                 "the file back as it was, or run it again into another --out"
             )
-        file = record_file(path, name)
-        if not file.exists():
-            if record.ended is not None:
-                raise RunError(f"{file}: not there: {anew(file)}")
-        elif apart := _apart(_read(file), record):
-            raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
+        check_record_file(path, record)
     return WholeRun(path, spec, scenarios, records)
+
+
+def check_record_file(path: Path, record: Record) -> None:
+    """Raises RunError, naming file and remedy, where the record of an episode that `results.sqlite` has is not the one
+    in its file, or that is gone or damaged."""
+    file = record_file(path, record.scenario)
+    if not file.exists():
+        if record.ended is not None:
+            raise RunError(f"{file}: not there: {anew(file)}")
+    elif apart := _apart(_read(file), record):
+        raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
 
 
 def record_file(path: Path, scenario_id: str) -> Path:

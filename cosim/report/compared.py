@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 
 import pandas as pd
 
+from cosim.judge.metrics import SUCCESS_IN_WORDS
 from cosim.records.comparison import ComparedRun, RunComparison
 from cosim.records.paired import FEWEST_CHANGED
 from cosim.records.results import BOOTSTRAP
@@ -79,14 +80,16 @@ def flips_in_words(told: RunComparison, other: ComparedRun) -> tuple[str, ...]:
 
 def how_to_read(told: RunComparison) -> str:
     """What the figures are, in words."""
-    shown = int((told.differences["n"] > 0).sum())
+    tables = [table for other in told.others for table in tables_of_comparison(told, other)]
+    shown = sum(row[-3] != "-" for table in tables for row in table.rows)
+    in_all = int(told.differences["low"].notna().sum())
     return (
         f"Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, {BOOTSTRAP} times, always "
         "the same. Within noise: the interval holds 0. Too few: it does not, but fewer than "
         f"{FEWEST_CHANGED} scenarios changed (of a rate: of those with a failure). "
-        f"One interval in twenty misses by chance alone: there are {shown}. "
-        "SR success, RC share of the route done, FC failures per 100 m travelled; the scenarios of an event are those "
-        "that have one on their way."
+        f"One interval in twenty misses by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for "
+        f"every metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures per 100 m "
+        "travelled; the scenarios of an event are those that have one on their way."
     )
 
 

@@ -13,6 +13,7 @@ environments drive it. The policy stands outside.
 
 from __future__ import annotations
 
+import statistics
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
@@ -106,6 +107,7 @@ class Episode:
         self._was_reset = False
         self._commands = InFlight()
         self._asked_s = 0.0
+        self._took_ms: list[float] = []
         self._result: tuple[Record, Log] | None = None
 
     def __enter__(self) -> Self:
@@ -192,6 +194,7 @@ class Episode:
             raise PolicyError(f"policy '{self.manifest.name}' {error}") from error
         options, frame = self.options, self._frame
         latency_ms = took_ms if options.real_time else options.latency_ms
+        self._took_ms.append(took_ms)
         self._commands.answered(now.tick, whole_ticks(latency_ms, self.clock.tick_ms), command)
         free_again = self._commands.arrived_by if options.real_time else 0
         while True:
@@ -216,6 +219,8 @@ class Episode:
         if self._result is None:
             record, log = self._scorer.result(self.record, self._commands)
             clock = {"wall_s": time.perf_counter() - self._began_s, "setup_s": self._setup_s}
+            if self._took_ms:
+                clock["answer_ms"] = statistics.median(self._took_ms)
             self._result = msgspec.structs.replace(record, injections=self._injected.log, clock=clock), log
         return self._result
 

@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import pandas as pd
@@ -147,9 +148,17 @@ def check_alone(options: EpisodeOptions, jobs: int, shared: bool) -> None:
         raise UsageError(f"in real time every answer is timed, and {much} would be timed too: take one job, without it")
 
 
-def measured_latency_ms(whole: Suite, first: Scenario, policy: str, options: EpisodeOptions) -> float:
-    """The latency that a policy shows on this machine: the median over an episode in real time, in a process of its
-    own. Raises UsageError when that does not come to its end."""
+class MeasuredLatency(NamedTuple):
+    """Medians over an episode. answer_ms: what the policy took for an answer. latency_ms: after what they answer the
+    commands took effect, at whole ticks."""
+
+    answer_ms: float
+    latency_ms: float
+
+
+def measured_latency(whole: Suite, first: Scenario, policy: str, options: EpisodeOptions) -> MeasuredLatency:
+    """The latency that a policy shows on this machine in an episode in real time, in a process of its own. Raises
+    UsageError when that does not come to its end."""
     alone = EpisodeOptions(
         seed=options.seed, robot=options.robot, goal=options.goal, own_camera=options.own_camera, camera=options.camera,
         real_time=True,
@@ -159,7 +168,7 @@ def measured_latency_ms(whole: Suite, first: Scenario, policy: str, options: Epi
         raise UsageError(
             f"the latency of '{policy}' cannot be measured: {first.id} is {row['status']}: {row['reason']}"
         )
-    return float(row["latency_ms"])
+    return MeasuredLatency(float(row["answer_ms"]), float(row["latency_ms"]))
 
 
 def seed_of_run(asked: int | None, resumed: Path | None) -> int:

@@ -30,7 +30,10 @@ def city_net(city: City) -> Path:
     """
     path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
     if not is_whole(path):
-        build_city(city, path)
+        try:
+            build_city(city, path)
+        except OSError as error:
+            raise unwritable(path, error, "set COSIM_CACHE to another folder") from error
     if city.net_hash and (found := net_content_hash(path)) != city.net_hash:
         raise MapError(
             f"{path}: the net's hash is {found}, but the scenario was made on {city.net_hash}: "
@@ -73,15 +76,12 @@ def write_city(city: City, folder: Path) -> City:
 
 
 def build_city(city: City, path: Path) -> None:
-    """Build a city's net at `path`, in one move: several processes may build the same city at once."""
+    """Build a city's net at `path`, in one move: several processes may build the same city at once. OSError passes."""
     from sumo_nets.city.built_net import city_as_net  # with all that plans a city: most were built before
 
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:
-            body = city_as_net(city, Path(folder))
-            finished = Path(folder) / path.name
-            finished.write_bytes(body + SEAL + _seal(body))
-            finished.replace(path)
-    except OSError as error:
-        raise unwritable(path, error, "set COSIM_CACHE to another folder") from error
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=".building-", dir=path.parent) as folder:
+        body = city_as_net(city, Path(folder))
+        finished = Path(folder) / path.name
+        finished.write_bytes(body + SEAL + _seal(body))
+        finished.replace(path)

@@ -76,8 +76,8 @@ def test_real_time_goes_with_one_process_and_no_latency() -> None:
 
 
 def test_tables_tell_of_latency_where_there_is_any() -> None:
-    """A given one as a number, a measured one with its range, of the episodes that ended, and what it is not; of none
-    nothing."""
+    """A given one as a number; of a measured one, of the episodes that ended, what answers took beside the whole ticks
+    after which their commands took effect, and what it is not; of none nothing."""
 
     def told(*records: Record) -> str:
         out, said = terminal()
@@ -87,10 +87,16 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
     none = begun(load_suite("reactive").scenarios[0], Manifest("m", camera=None), "h")
     given = msgspec.structs.replace(none, latency_ms=200.0)
     crashed = msgspec.structs.replace(none, real_time=True)
-    real = [msgspec.structs.replace(crashed, latency_ms=ms, ended="goal") for ms in (100.0, 150.0, 400.0)]
+    real = [
+        msgspec.structs.replace(crashed, latency_ms=ms, ended="goal", clock={"answer_ms": took_ms})
+        for ms, took_ms in ((50.0, 3.124), (50.0, 4.0), (400.0, 391.6))
+    ]
     assert "latency" not in told(none)
     assert "latency 200 ms: commands take effect so much later" in told(given)
-    assert "in real time: latency of an episode's answers 150 ms (100 to 400 ms)" in told(*real, crashed, crashed)
+    assert (
+        "in real time: the median answer took 4 ms (3.12 to 392 ms); commands took effect 50 ms (50 to 400 ms) "
+        "after what they answer, at whole ticks of 50 ms" in told(*real, crashed, crashed)
+    )
     assert "no episode came to its end" in told(crashed)
     assert "not to be had again from the seed" in told(*real)
 
@@ -100,9 +106,10 @@ def test_tables_tell_of_latency_where_there_is_any() -> None:
     [
         ("soon", False, "--latency 'soon': give milliseconds, like 200, or 'measured'"),
         ("200", True, "--real-time measures the latency of every answer: leave --latency out"),
-        ("-1", False, "latency_ms must be from 0 to 10000 ms, not -1"),
+        ("-1", False, "--latency -1: milliseconds must be from 0 to 10000"),
+        ("nan", False, "--latency nan: milliseconds must be from 0 to 10000"),
     ],
-    ids=["a word", "both", "negative"],
+    ids=["a word", "both", "negative", "no number"],
 )
 def test_a_latency_that_cannot_be_had_is_refused(asked: str, real_time: bool, told: str) -> None:
     """By name, with the remedy."""
@@ -178,7 +185,8 @@ def test_in_real_time_answers_are_as_late_as_they_were_and_the_record_replays(sc
     asked, delays = log.answers[:, 0], log.answers[:, 1]
     assert (delays >= 4).all() and asked.tolist() == slow.asked and (asked[1:] >= (asked + delays)[:-1]).all()
     assert np.array_equal(log.command, commands(log.answers, len(log)))
-    assert record.latency_ms == 50.0 * np.median(delays)
+    assert record.latency_ms == 50.0 * np.median(delays) and record.answer_ms is not None
+    assert record.latency_ms - 50.0 < record.answer_ms <= record.latency_ms
     assert replayed(Recorded(scenario, record, log)) == record.state_hash
 
 
@@ -214,4 +222,4 @@ def test_a_latency_is_not_taken_from_an_episode_that_did_not_end(
     monkeypatch.setattr(suite_run, "run", lambda *_, **__: pd.DataFrame([row]))
     suite = Suite(name="brief", version="1", scenarios=(scenario,))
     with pytest.raises(UsageError, match=f"cannot be measured: {scenario.id} is {status}: no memory"):
-        suite_run.measured_latency_ms(suite, scenario, "mine", EpisodeOptions())
+        suite_run.measured_latency(suite, scenario, "mine", EpisodeOptions())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import os
@@ -100,6 +101,17 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     assert told.flipped.loc[told.flipped["flip"] == "lost", ["ended_before", "ended_after"]].values.tolist() == [
         ["goal", "failure"]
     ]
+
+
+def test_intervals_are_counted_where_they_stand(runs: Path) -> None:
+    """Who reads the tables is told how many intervals are in them, and how many more are in the .csv of all metrics."""
+    told = compare_runs([runs / "a", runs / "b", runs / "c"])
+    page = as_markdown(told)
+    shown = len(re.findall(r"\| [+-][\d.]+ to [+-][\d.]+ \|", page))
+    lines = csv.DictReader(io.StringIO(told.differences.to_csv(index=False)))
+    in_all = sum(line["low"] != "" for line in lines)
+    assert 0 < shown < in_all
+    assert f"{shown} stand in these tables, {in_all} in a .csv" in page.replace("\\", "")
 
 
 def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
@@ -269,7 +281,10 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda run: other_suite(run, "s"),
         "run both on the same version of it (edited, robot, --crowd?)",
     ),
-    "no run": (lambda run: (run / "run.json").unlink(), "unknown run '{run}'. Valid choices: {first_name}"),
+    "no run": (
+        lambda run: (run / "run.json").unlink(),
+        "{run} is no run folder: it holds no run.json. Runs in it and beside it: {first}",
+    ),
     "a damaged database": (
         lambda run: (run / "results.sqlite").write_bytes(b"nothing" * 500),
         "{run}/results.sqlite is",
@@ -287,7 +302,7 @@ def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path: Path, cosim: C
     assert said.returncode == 2 and not said.stdout and not (tmp_path / "out.csv").exists()
     comparing, told = said.stderr.splitlines()
     assert comparing == "comparing 2 runs ..." and told.startswith("error: ")
-    assert words.format(run=run, first=first, first_name="first") in told
+    assert words.format(run=run, first=first) in told
 
 
 def test_a_run_that_goes_on_is_not_compared(tmp_path: Path, cosim: Cosim) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sqlite3
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from cosim.core.errors import RunError, UsageError
+from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.episode.log import Log
 from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.judge.metrics import METRICS
@@ -318,11 +319,29 @@ def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:
 
 
 def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
-    """What is no run folder is answered with the runs that lie beside it."""
-    with RunFolder.create(tmp_path / "mine", SPEC, SUITE):
-        pass
-    with pytest.raises(UsageError, match=r"unknown run .*other'\. Valid choices: mine"):
-        read_records(tmp_path / "other")
+    """What is no run folder is answered with what it lacks and the runs that lie in it and beside it; a file with what
+    a run is."""
+    for name in ("mine", "runs/theirs"):
+        with RunFolder.create(tmp_path / name, SPEC, SUITE):
+            pass
+    (tmp_path / "file").touch()
+    for name, told in (
+        ("other", "unknown run '{run}'. Valid choices: {beside}/mine. Did you mean"),
+        ("runs", "{run} is no run folder: it holds no run.json. Runs in it and beside it: {beside}/mine, {run}/theirs"),
+        ("file", "{run} is no run folder: a file is there, and a run is a folder with run.json"),
+    ):
+        with pytest.raises(UsageError, match=re.escape(told.format(run=tmp_path / name, beside=tmp_path))):
+            read_records(tmp_path / name)
+
+
+@pytest.mark.parametrize("below", ["run", "runs/run"])
+def test_a_run_below_a_file_is_told_which_file_and_where_else(tmp_path: Path, below: str) -> None:
+    """The path leads through a file: that file is named, and a place beside it."""
+    (tmp_path / "file").touch()
+    path = tmp_path / "file" / below
+    told = f"{path}: cannot be written: {tmp_path / 'file'} is a file, no folder: choose a place beside it, like "
+    with pytest.raises(MachineError, match=re.escape(f"{told}{tmp_path / below}")):
+        RunFolder.create(path, SPEC, SUITE).__enter__()
 
 
 @pytest.mark.parametrize(

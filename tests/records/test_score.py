@@ -218,25 +218,23 @@ def test_a_damaged_episode_is_refused_and_can_be_mended(tmp_path: Path, cosim: C
         assert folder.finished() == {"s-000", "s-002"}
 
 
-@pytest.mark.parametrize("damage", ["no run.json", "no folder"])
-def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim, damage: str) -> None:
-    """A run.json that cannot be read, or a file in place of the folder: one line, without the words of the system."""
+def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim) -> None:
+    """A run.json that cannot be read: one line, without the words of the system."""
     run = tmp_path / "run"
-    if damage == "no folder":
-        run.touch()
-    else:
-        run.mkdir()
-        (run / "run.json").write_text("no JSON")
+    run.mkdir()
+    (run / "run.json").write_text("no JSON")
     told = refusal(cosim, run)
     assert f"error: {run / 'run.json'}: cannot be read: " in told and "name another run" in told and "Errno" not in told
 
 
 def test_a_record_that_is_not_what_the_database_has_is_refused(tmp_path: Path, cosim: Cosim) -> None:
-    """The file alone was edited: the first thing that is apart is named."""
+    """The file alone was edited: the first thing that is apart is named, by `score` and by `show`."""
     run = run_of(tmp_path / "run", ["goal"])
     file = run / "episodes/s-000/record.json"
     file.write_text(file.read_text().replace('"success": 1.0', '"success": 0.5'))
     told = refusal(cosim, run)
+    shown = cosim("show", str(run))
+    assert shown.returncode == 2 and not shown.stdout and shown.stderr.splitlines()[-1] == told.splitlines()[-1]
     assert f"{file}: not what results.sqlite has of this episode: measures.success is 0.5, there 1.0: remove" in told
 
 

@@ -229,7 +229,8 @@ def test_an_event_that_does_not_fit_is_told_where_it_does() -> None:
 
 @pytest.mark.engine
 def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table; a name that is taken is refused."""
+    """`new`, `check`, `draw`, `run`: from nothing to a picture and a table, with latency; a name that is taken is
+    refused."""
     done = cosim("scenario", "new", "mine.toml", cwd=tmp_path)
     assert done.returncode == 0 and (tmp_path / "mine.toml").read_text().count('name = "mine"') == 1
     again, done = (cosim("scenario", *words, cwd=tmp_path) for words in (("new", "mine.toml"), ("check", "mine.toml")))
@@ -242,8 +243,10 @@ def test_what_is_written_anew_is_sound_can_be_drawn_and_runs(tmp_path: Path, cos
     assert done.returncode == 2 and "shows nothing of the place" in done.stderr and not (tmp_path / "far.png").exists()
     text = (tmp_path / "mine.toml").read_text()
     (tmp_path / "mine.toml").write_text(text.replace("# time_s = 260", "time_s = 1"))
-    done = cosim("scenario", "run", "mine.toml", "--policy", "straight", "--out", "run", cwd=tmp_path)
+    words = ("scenario", "run", "mine.toml", "--policy", "straight", "--latency", "100", "--out", "run")
+    done = cosim(*words, cwd=tmp_path)
     assert done.returncode == 0 and "Run folder: run" in done.stdout, done.stderr
+    assert "latency 100 ms: commands take effect so much later" in done.stdout
 
 
 @pytest.mark.engine

@@ -135,15 +135,20 @@ def test_a_sweep_is_one_command(examples: Path, cosim: Cosim) -> None:
 
 @pytest.mark.engine
 def test_a_sweep_over_what_the_policy_is_told_is_as_many_runs(tmp_path: Path, cosim: Cosim) -> None:
-    """A run folder for each goal protocol, all of one seed, and one table of them."""
+    """A run folder for each goal protocol, all of one seed and in real time as asked, and one table of them; a
+    recording of several is refused before anything runs."""
     (tmp_path / "told.toml").write_text(
         'name = "told"\ngoal_protocol = ["route_point", "final_point"]\n'
         '[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\n[limits]\ntime_s = 0.5\n'
     )
-    done = cosim("scenario", "run", "told.toml", "--policy", "stop", "--out", "runs", cwd=tmp_path)
+    words = ("scenario", "run", "told.toml", "--policy", "stop", "--out", "runs")
+    done = cosim(*words, "--real-time", cwd=tmp_path)
     assert done.returncode == 0 and "goal_protocol" in done.stdout, done.stderr
     rows = pd.concat(pd.read_csv(tmp_path / "runs" / goal / "results.csv") for goal in ("route_point", "final_point"))
     assert rows["goal_protocol"].tolist() == ["route_point", "final_point"] and rows["run_seed"].nunique() == 1
+    assert rows["real_time"].all() and rows["answer_ms"].notna().all()
     assert len(pd.read_csv(tmp_path / "runs" / "sweep.csv")) == 2 * len(METRICS)
+    several = cosim(*words[:-1], "others", "--rerun", "both.rrd", cwd=tmp_path)
+    assert several.returncode == 2 and "and 2 are asked for" in several.stderr and not (tmp_path / "others").exists()
     refused = cosim("run", "told.toml", cwd=tmp_path)
     assert refused.returncode == 2 and "goal_protocol 'route_point' is of a run" in refused.stderr

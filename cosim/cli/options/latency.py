@@ -37,17 +37,21 @@ def with_latency(
     """Options with the latency that was asked for; measured by driving `first`, or that of the run that is resumed.
     policy, rate_hz: its name, and how often it acts. Raises UsageError."""
     from cosim.records.run_folder import read_spec
-    from scenarios.execution.suite_run import measured_latency_ms
+    from scenarios.execution.suite_run import measured_latency
 
-    if real_time and asked:
-        raise UsageError("--real-time measures the latency of every answer: leave --latency out")
-    if asked != "measured":
-        return msgspec.structs.replace(options, latency_ms=_milliseconds(asked or "0"), real_time=real_time)
+    latency_ms = asked_latency_ms(asked, real_time)
+    if latency_ms is not None:
+        return msgspec.structs.replace(options, latency_ms=latency_ms, real_time=real_time)
     if resumed is not None:
         return msgspec.structs.replace(options, latency_ms=read_spec(resumed).latency_ms)
     with doing(f"measuring the latency of {policy} in {first.id}"):
-        latency_ms = measured_latency_ms(whole, first, policy, options)
-    err.print(f"Latency {latency_ms:g} ms, measured in {first.id}: that of every command of this run.", highlight=False)
+        answer_ms, latency_ms = measured_latency(whole, first, policy, options)
+    err.print(
+        f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an answer took {answer_ms:.3g} "
+        "ms (median), and commands take effect at whole ticks of 50 ms.",
+        soft_wrap=True,
+        highlight=False,
+    )
     if latency_ms > (period_ms := 1000.0 / rate_hz):
         err.print(
             f"That is longer than its period of {period_ms:g} ms, at which it is asked all the same. With --real-time "
@@ -58,8 +62,18 @@ def with_latency(
     return msgspec.structs.replace(options, latency_ms=latency_ms)
 
 
-def _milliseconds(text: str) -> float:
+def asked_latency_ms(text: str, real_time: bool) -> float | None:
+    """The latency that was asked for, None where it is to be measured before the run. Raises UsageError."""
+    from cosim.spec.options import MOST_LATENCY_MS
+
+    if real_time and text:
+        raise UsageError("--real-time measures the latency of every answer: leave --latency out")
+    if text == "measured":
+        return None
     try:
-        return float(text)
+        latency_ms = float(text or "0")
     except ValueError:
         raise UsageError(f"--latency '{text}': give milliseconds, like 200, or 'measured'") from None
+    if not 0.0 <= latency_ms <= MOST_LATENCY_MS:
+        raise UsageError(f"--latency {text}: milliseconds must be from 0 to {MOST_LATENCY_MS:g}")
+    return latency_ms

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cosim.core.errors import MachineError, UsageError
+from cosim.core.errors import UsageError, unwritable
 
 PICTURES = (".png", ".jpg", ".jpeg")
 
@@ -14,4 +14,4 @@ def check_output(path: Path, what: str = "a picture", endings: tuple[str, ...] =
     if path.suffix.lower() not in endings:
         raise UsageError(f"{path}: cannot be written as {what}; use a name that ends in {' or '.join(endings[:2])}")
     if not path.resolve().parent.is_dir():
-        raise MachineError(f"{path}: cannot be written: no folder {path.parent}")
+        raise unwritable(path, NotADirectoryError(f"no folder {path.parent}"))

@@ -43,12 +43,15 @@ def show(
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
     from cosim.records.results import table_of
     from cosim.records.run_folder import read_records, read_spec
+    from cosim.records.whole_run import check_record_file
 
     spec = read_spec(folder)
     records = {record.scenario: record for record in read_records(folder)}
     if rerun is not None:
         write_rerun(folder, [] if episode is None else [episode], rerun)
         return
+    for record in records.values():
+        check_record_file(folder, record)
     if events:
         if episode is not None:
             raise UsageError("--events is about a whole run: leave --episode out")
@@ -84,8 +87,9 @@ def print_episode(out: Console, record: Record) -> None:
 
     out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
     if record.latency_ms or record.real_time:
-        real = ", the median of what was measured: replayed, never made again" if record.real_time else ""
-        out.print(f"  commands took effect {record.latency_ms:g} ms after what they answer{real}", soft_wrap=True)
+        real = ", a median in whole ticks of 50 ms: replayed, never made again" if record.real_time else ""
+        took = "" if record.answer_ms is None else f"the policy took {record.answer_ms:.3g} ms for an answer (median); "
+        out.print(f"  {took}commands took effect {record.latency_ms:g} ms after what they answer{real}", soft_wrap=True)
     for failure in record.failures:
         what = f" with {failure.other_kind} {failure.other}" if failure.other else ""
         fault = f", {failure.fault}" if failure.fault else ""

@@ -14,7 +14,7 @@ import typer
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
 from cosim.cli.options.endpoint import LONGEST_WAIT_S, Insecure, Tls, ends_of_run, warned
-from cosim.cli.options.latency import LATENCY_HELP, REAL_TIME_HELP, with_latency
+from cosim.cli.options.latency import LATENCY_HELP, REAL_TIME_HELP, asked_latency_ms, with_latency
 from cosim.cli.options.recording import RERUN_HELP, check_rerun, write_rerun
 from cosim.cli.options.street import (
     CHILDREN_HELP,
@@ -132,6 +132,7 @@ def run_command(
     from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
     from scenarios.rendering.shared import SharedRenderer, check_shared
 
+    asked_latency_ms(latency, real_time)
     air, away = ends_of_run(live, director, tls, insecure)
     for line in [] if away is None else notices_of(away):
         warned(line)

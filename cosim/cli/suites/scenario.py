@@ -8,11 +8,14 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import msgspec
 import typer
 from rich import box
 from rich.table import Column, Table
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
+from cosim.cli.options.latency import LATENCY_HELP, REAL_TIME_HELP, asked_latency_ms, with_latency
+from cosim.cli.options.recording import RERUN_HELP, check_rerun, write_rerun
 from cosim.cli.terminal.board import Board
 from cosim.cli.terminal.consoles import err, out
 from cosim.cli.terminal.progress import doing
@@ -165,7 +168,8 @@ def draw_own(
     "run",
     epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
     "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
-    "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`",
+    "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"
+    "`cosim scenario run mine.toml --policy my_robot.policy:Mine --real-time --rerun mine.rrd`",
 )
 def run_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
@@ -176,6 +180,9 @@ def run_own(
     seed: Annotated[int | None, typer.Option(min=0, help="Of the run: policies' own seeds are drawn from it.")] = None,
     frames: Annotated[float, typer.Option(min=0.0, help="Keep a camera frame every so many seconds.")] = 0.0,
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
+    latency: Annotated[str, typer.Option(metavar="MS", help=LATENCY_HELP)] = "",
+    real_time: Annotated[bool, typer.Option("--real-time", help=REAL_TIME_HELP)] = False,
+    rerun: Annotated[Path | None, typer.Option(metavar="FILE.rrd", help=RERUN_HELP)] = None,
 ) -> None:
     """Run what a file makes, into an ordinary run folder; of a sweep print a table by its values, and draw it.
 
@@ -191,6 +198,8 @@ def run_own(
     if resume and folder is None:
         raise UsageError("--resume needs --out: the folder of the run to finish")
     own = read_own(file)
+    check_rerun(rerun, len(own.variants))
+    asked_latency_ms(latency, real_time)
     with doing(f"checking {file}") as tell:
         suite = checked_own(own, tell)
     manifest = load_policy(policy).manifest
@@ -206,13 +215,18 @@ def run_own(
         read_spec(path)
     run_seed = seed_of_run(seed, begun[0] if begun else None)
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
+    first = own.variants[0]
+    options = EpisodeOptions(seed=run_seed, goal=first.own.goal_protocol, frames_every_s=frames, camera=drawn_by)
+    (driven_first,) = (one for one in suite.scenarios if one.id == first.id)
+    went_on = begun[0] if begun else None
+    options = with_latency(options, latency, real_time, went_on, suite, driven_first, policy, manifest.rate_hz)
     _say(own)
     tables = []
     for goal, ids in by_goal.items():
         part = parts[goal]
         done = {record.scenario for record in read_records(part)} if part in begun else set()
         board = Board([one for one in suite.scenarios if one.id in ids], done)
-        options = EpisodeOptions(seed=run_seed, goal=goal, frames_every_s=frames, camera=drawn_by)
+        options = msgspec.structs.replace(options, goal=goal)
         try:
             with board.bars:
                 table = run(
@@ -224,6 +238,7 @@ def run_own(
             raise typer.Exit(INTERRUPTED) from None
         tables.append(table)
     _print_run(own, tables, path)
+    write_rerun(path, [first.id], rerun)
 
 
 def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None:
@@ -252,6 +267,7 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
 
 def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
     """A row for each value: means, with their intervals below."""
+    from cosim.judge.metrics import SUCCESS_IN_WORDS
     from scenarios.own.sweep import SWEPT
 
     columns = [Column(field.replace(".", ".\n"), overflow="fold") for field in fields]
@@ -267,8 +283,8 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
         shown.add_row(*(f"{value}" for value in values), scored, *cells)
     out.print(shown)
     out.print(
-        "n episodes that are scored; SR success: the goal reached in time without a failure; SPL the same by path "
-        "length; RC share of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
+        f"n episodes that are scored; SR {SUCCESS_IN_WORDS}; SPL the same by path length; "
+        "RC share of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
     )
 
 

@@ -10,7 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
-from cosim.judge.metrics import COUNTERFACTUAL
+from cosim.judge.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.records.results import not_to_be_quoted, summary_of
 from cosim.spec.scenario import Scenario, read_suite
 
@@ -24,7 +24,7 @@ SHOWN = (
     ("velocity_mean_mps", "V"),
 )
 LETTERS = {
-    "SR": "success: the goal reached in time without a failure",
+    "SR": SUCCESS_IN_WORDS,
     "RC": "share of the route done",
     "FC": "failures per 100 m travelled",
     "C": "collisions per 100 m travelled",
@@ -137,11 +137,17 @@ def _latency_in_words(table: pd.DataFrame) -> str:
     late_ms = table.loc[table["ended"].notna(), "latency_ms"] if measured else table["latency_ms"]
     if not len(late_ms):
         return "in real time: no episode came to its end, so no latency was measured"
-    least, middle, most = (f"{late_ms.quantile(q):g}" for q in (0.0, 0.5, 1.0))
     if not measured:
-        return f"latency {middle} ms: commands take effect so much later than what they answer"
-    told = f"latency of an episode's answers {middle} ms ({least} to {most} ms)"
-    return f"in real time: {told}, as measured here; not to be had again from the seed, only replayed"
+        return f"latency {late_ms.median():g} ms: commands take effect so much later than what they answer"
+    told = f"commands took effect {_median_and_range(late_ms)} after what they answer, at whole ticks of 50 ms"
+    if len(took_ms := table["answer_ms"].dropna()):
+        told = f"the median answer took {_median_and_range(took_ms)}; {told}"
+    return f"in real time: {told}; as measured here, not to be had again from the seed, only replayed"
+
+
+def _median_and_range(of_episodes_ms: pd.Series[float]) -> str:
+    least, middle, most = (f"{of_episodes_ms.quantile(q):.3g}" for q in (0.0, 0.5, 1.0))
+    return f"{middle} ms ({least} to {most} ms)"
 
 
 def print_delays(out: Console, table: pd.DataFrame) -> None:

@@ -22,9 +22,10 @@ from cosim.cli.terminal.run_table import (
     print_table,
 )
 from cosim.core.errors import unknown
-from cosim.judge.metrics import METRICS
+from cosim.judge.metrics import METRICS, SUCCESS_IN_WORDS
 from cosim.spec.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, load_suite
+from scenarios.events.table import EVENT_KINDS
 from scenarios.viewing.eventsheet import COLUMNS
 
 
@@ -97,6 +98,19 @@ def test_every_letter_and_heading_is_explained_under_its_table() -> None:
     out, said = terminal()
     print_by_kind(out, table, kinds)
     assert "share of these" in " ".join(said.getvalue().split())
+
+
+def test_success_names_the_events_that_end_otherwise() -> None:
+    """Under every table that gives SR stands which events ask for a stop, and which for passing round, by name."""
+    out, said = terminal()
+    print_table(out, pair_of_kinds()[0], 2)
+    assert SUCCESS_IN_WORDS in " ".join(said.getvalue().split())
+    stop, rule = SUCCESS_IN_WORDS.split("(")[1:]
+    assert all(kind.name in stop for kind in EVENT_KINDS.values() if kind.ends_at == "stop")
+    assert all(kind.name in rule for kind in EVENT_KINDS.values() if kind.passed_round)
+    assert sum(kind.name in SUCCESS_IN_WORDS for kind in EVENT_KINDS.values()) == sum(
+        kind.ends_at == "stop" or kind.passed_round for kind in EVENT_KINDS.values()
+    )
 
 
 def test_the_table_by_kind_fits_80_columns() -> None:
