@@ -374,7 +374,7 @@ def test_a_suite_without_scenarios_is_refused(desk: Path, cosim: Cosim) -> None:
 
 def test_a_run_that_cannot_be_on_the_air_leaves_no_folder(desk: Path, cosim: Cosim) -> None:
     """A wrong endpoint is told with the remedy, and the same command with a right one is not refused."""
-    said = cosim("run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--out", "air", cwd=desk)
+    said = cosim("run", "tiny.json", "--live", "tcp/192.0.2.1:7447", "--insecure", "--out", "air", cwd=desk)
     assert said.returncode == 3 and not (desk / "air").exists()
     assert "cannot listen at tcp/192.0.2.1:7447" in said.stderr and "Choose an address of this" in said.stderr
     heard = cosim("listen", "--connect", "7447", cwd=desk)
