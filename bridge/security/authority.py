@@ -70,7 +70,7 @@ def issue(folder: Path, role: Role, hosts: Sequence[str], days: int, *, renew: b
     if role in ("coordinator", "director") and not names:
         raise UsageError(f"others connect to a {role}: say by which names or addresses, --host NAME")
     if role not in HUBS and names:
-        raise UsageError(f"nobody connects to a {role}: leave out --host")
+        raise UsageError(f"--host is for those who listen, and the role {role} does not: leave out --host")
     _issue(folder, role, names, days, datetime.now(UTC))
     return place
 

@@ -75,9 +75,7 @@ def checked_identity(connection: Connection, now: datetime | None = None) -> str
     found = identity_in(folder)
     now = datetime.now(UTC) if now is None else now
     if found.role != connection.role:
-        raise AccessError(
-            f"{folder} is of a {found.role}, and this needs one of a {connection.role}: see `cosim certs`"
-        )
+        raise AccessError(f"{folder} is of the role {found.role}, and this needs {connection.role}: see `cosim certs`")
     if connection.listen and not found.hosts:
         raise AccessError(f"{folder / CERTIFICATE} names no host: make it anew with --host")
     renew = f"`cosim certs role ... {found.role} --renew` makes another"

@@ -43,7 +43,7 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         if bool(self.listen) == bool(self.connect):
             raise UsageError("one end of a session listens or connects: name one endpoint")
         if self.listen and self.role not in HUBS:
-            raise UsageError(f"a {self.role} listens nowhere, it connects. Those who listen: {', '.join(HUBS)}.")
+            raise UsageError(f"the role {self.role} listens nowhere, it connects. Those who listen: {', '.join(HUBS)}.")
         protocol, address = _parts(checked_endpoint(self.endpoint, "endpoint"))
         if self.tls and self.insecure:
             raise UsageError("--tls guards and --insecure does not: choose one")
@@ -51,8 +51,8 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
             raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {self.endpoint}")
         if protocol == "tls" and not self.tls:
             raise UsageError(
-                f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of a {self.role}: "
-                "`cosim certs` makes them"
+                f"{self.endpoint} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of the role "
+                f"{self.role}: `cosim certs` makes them"
             )
         if not (self.tls or self.insecure or self.of_this_machine):
             raise UsageError(

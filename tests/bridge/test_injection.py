@@ -17,11 +17,13 @@ import msgspec
 import pytest
 
 from bridge.live import LARGEST_B, answer_to
+from bridge.security.authority import issue, make_authority
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.injection import Ack, Injected, Injection
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
 from scenarios.execution.injected import MOST_INJECTED, InjectedPeople
+from tests.bridge.security.plain import free_port
 from tests.conftest import PATIENCE_S, Cosim
 
 TICK_MS = 50
@@ -273,7 +275,7 @@ def once(what: Callable[[], bool]) -> None:
 
 
 @contextmanager
-def on_air(folder: Path) -> Iterator[OnAir]:
+def on_air(folder: Path, at: str, *guard: str) -> Iterator[OnAir]:
     """`cosim run --live` of an episode that lasts until it is told to end."""
     from scenarios.builders.long_horizon import build_long_horizon
     from scenarios.execution.places import place
@@ -285,9 +287,8 @@ def on_air(folder: Path) -> Iterator[OnAir]:
     short = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3600.0, ends_on_failure=True, events=())
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
     (folder / "slow.py").write_text(SLOW)
-    at = f"unixsock-stream/{folder}/air.sock"
     words = [sys.executable, "-m", "cosim", "run", "tiny.json", "--policy", "slow:Slow", "--camera", "bullet"]
-    with subprocess.Popen([*words, "--out", "run", "--live", at], cwd=folder, text=True) as run:
+    with subprocess.Popen([*words, "--out", "run", "--live", at, *guard], cwd=folder, text=True) as run:
         try:
             yield OnAir(run, folder, at, [(x, y) for x, y in whole.route[20:26]])
         finally:
@@ -296,24 +297,30 @@ def on_air(folder: Path) -> Iterator[OnAir]:
 
 @pytest.mark.engine
 def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays(tmp_path: Path, cosim: Cosim) -> None:
-    """`cosim inject` beside `cosim run --live`; `cosim replay` comes to the same state hash, given the injection."""
-    with on_air(tmp_path) as air:
+    """`cosim inject` and `listen` beside `cosim run --live`, each with its own certificate alone; `cosim replay` comes
+    to the same state hash, given the injection."""
+    certs, at = tmp_path / "certs", f"tls/localhost:{free_port()}"
+    make_authority(certs, ["localhost"], 1)
+    viewer, injector = (("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector"))  # type: ignore[arg-type]
+    with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
         there = ("--connect", air.at, "--wait", str(PATIENCE_S))
         message = json.dumps({"id": "anna", "path": [air.way[0], air.way[-1]], "doing": "stop"})
-        sent = cosim("inject", message, *there)
+        sent = cosim("inject", message, *there, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
-        again = cosim("inject", message, *there)
+        again = cosim("inject", message, *there, *injector)
         assert again.returncode == 2 and "of this id" in again.stderr
-        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9")
+        swapped = cosim("inject", message, *there, *viewer)
+        assert swapped.returncode == 2 and "is of the role viewer, and this needs injector" in swapped.stderr
+        elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
         once(lambda: "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr and said.returncode == 2)
 
         def in_the_log() -> list[str]:
-            told = cosim("listen", "events", *there, "--seconds", "0")
+            told = cosim("listen", "events", *there, *viewer, "--seconds", "0")
             assert told.returncode == 0, told
             return [one["injection"]["id"] for one in json.loads(told.stdout.splitlines()[0])["injections"]]
 
         once(lambda: in_the_log() == ["anna"])
-        words = [sys.executable, "-m", "cosim", "listen", "robot", *there]
+        words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
         for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
                 assert listener.stdout is not None
@@ -340,7 +347,7 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, c
     readme = (Path(__file__).parents[2] / "README.md").read_text()
     found = re.search(r"```python\n(import json, zenoh\n.*?)```", readme, re.DOTALL)
     assert found is not None
-    with on_air(tmp_path) as air:
+    with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
         script = found[1].replace("tcp/127.0.0.1:7447", air.at)
         script = script.replace("[170, 252], [190, 252]", json.dumps([air.way[0], air.way[-1]])[1:-1])
         (tmp_path / "ten.py").write_text(script)

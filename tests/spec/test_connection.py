@@ -46,7 +46,7 @@ def test_contradictions_are_refused() -> None:
         ("choose one", {"listen": "tls/0.0.0.0:7447", "tls": "certs", "insecure": True}),
         ("name one endpoint", {}),
         ("name one endpoint", {"listen": "tcp/127.0.0.1:7447", "connect": "tcp/127.0.0.1:7447"}),
-        ("a worker listens nowhere", {"listen": "tcp/127.0.0.1:7447", "role": "worker"}),
+        ("the role worker listens nowhere", {"listen": "tcp/127.0.0.1:7447", "role": "worker"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "7447"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "udp/127.0.0.1:7447"}),
         ("write it as PROTOCOL/ADDRESS", {"listen": "tls/h:7447#verify_name_on_connect=false", "tls": "certs"}),

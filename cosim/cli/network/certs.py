@@ -82,5 +82,5 @@ def _print_made(place: Path) -> None:
 
     who = identity_in(place)
     names = f", reached by {', '.join(who.hosts)}" if who.hosts else ""
-    words = f"{place}: a {who.role}{names}, valid until {time_left(who)}"
+    words = f"{place}: role {who.role}{names}, valid until {time_left(who)}"
     out.print(words, soft_wrap=True, markup=False, highlight=False)

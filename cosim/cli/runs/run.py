@@ -134,7 +134,7 @@ def run_command(
 
     asked_latency_ms(latency, real_time)
     air, away = ends_of_run(live, director, tls, insecure)
-    for line in [] if away is None else notices_of(away):
+    for line in (line for end in (air, away) if end is not None for line in notices_of(end)):
         warned(line)
     if map_name is not None:
         from scenarios.builders.sample import suite_on_map
@@ -188,7 +188,7 @@ def run_command(
     spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
     with ExitStack() as stack:
         if on_air is not None:
-            hub = stack.enter_context(open_session(on_air.connection, warned))
+            hub = stack.enter_context(open_session(on_air.connection))
             options = msgspec.structs.replace(options, live=Live(connection=hub.inside, run=named))
             err.print(f"On the air at {live}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
         held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)

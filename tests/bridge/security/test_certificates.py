@@ -51,7 +51,7 @@ def test_the_command_makes_shows_and_never_overwrites(tmp_path: Path, cosim: Cos
         ("role", str(folder), "guest"): "Valid choices: coordinator, director",
         ("role", str(folder), "director"): "--host NAME",
         ("role", str(folder), "worker", "--host", "a b"): "a name or address of a machine",
-        ("role", str(folder), "worker", "--host", "w.lan"): "nobody connects to a worker",
+        ("role", str(folder), "worker", "--host", "w.lan"): "the role worker does not",
         ("role", str(tmp_path / "none"), "worker"): "holds no authority",
         ("show", str(tmp_path)): "holds no certificate",
     }.items():
@@ -101,7 +101,7 @@ def test_files_that_do_not_fit_are_told_apart(made: Path, tmp_path: Path) -> Non
         "everybody's key": "chmod 600",
     }.items():
         assert words in refused(change), change
-    assert "is of a worker, and this needs one of a viewer" in refused("", "viewer")
+    assert "is of the role worker, and this needs viewer" in refused("", "viewer")
 
 
 def test_the_end_of_a_certificate_is_said_before_it_comes(made: Path) -> None:

@@ -11,6 +11,7 @@ from typing import get_args
 import pytest
 import zenoh
 
+from bridge.live import LARGEST_B
 from bridge.security.authority import issue, make_authority
 from bridge.session import open_session
 from cosim.core.errors import EngineError
@@ -199,3 +200,42 @@ def test_without_certificates_nobody_tells_where_the_robot_is() -> None:
         air = Air(None, stack)
         may = tuple(key for key in ASKED if any(key in theirs for theirs in MAY_ASK.values()))
         try_all(air, Guest(air, "", stack), may, watches=True, answers=True, shows=True)
+
+
+@pytest.mark.parametrize(("hub", "key"), [("director", f"{ENV}/director"), ("policy", POLICY)])
+def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -> None:
+    """At the hub of a director or a policy server, workers and coordinators ask; others do not, and nobody answers."""
+    at = f"tls/localhost:{free_port()}"
+    asked: list[bytes] = []
+    with ExitStack() as stack:
+        session = stack.enter_context(open_session(Connection(role=hub, listen=at, tls=str(certs / hub))))
+        session.serve(key, lambda payload: asked.append(payload) or b"honest")  # type: ignore[func-returns-value]
+        guests = {role: stack.enter_context(plain_zenoh(at, certs, role)) for role in get_args(Role)}
+        for guest in guests.values():
+            guest.declare_queryable(key, lambda query: query.reply(query.key_expr, b"FORGED"))
+        for role in ("worker", "coordinator"):
+            until(lambda role=role: "honest" in replies(guests[role], key))  # type: ignore[misc]
+        asked.clear()
+        for role in ("director", "policy", "viewer", "injector"):
+            assert set(replies(guests[role], key)) == {"FORGED"}, "its own answer, and nobody else's"
+        assert asked == []
+        assert session.ask(key, b"x", timeout_s=PATIENCE_S) == b"honest"
+
+
+def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
+    """An injection of 64 KiB arrives, one byte more does not; what nobody may send at all ends nobody's link."""
+    at = f"tls/localhost:{free_port()}"
+    lengths: list[int] = []
+    with ExitStack() as stack:
+        hub = stack.enter_context(
+            open_session(Connection(role="coordinator", listen=at, tls=str(certs / "coordinator")))
+        )
+        for key in (f"{ENV}/inject", f"{ENV}/status"):
+            hub.serve(key, lambda payload: lengths.append(len(payload)) or b"taken")  # type: ignore[func-returns-value]
+        guest = stack.enter_context(plain_zenoh(at, certs, "injector"))
+        until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
+        lengths.clear()
+        for length in (LARGEST_B, LARGEST_B + 1, 1 << 20, 20 << 20):
+            list(guest.get(f"{ENV}/inject", payload=bytes(length), timeout=2.0))
+        until(lambda: replies(guest, f"{ENV}/status") == ["taken"])
+        assert lengths == [LARGEST_B, len(OWN)]

@@ -1,0 +1,48 @@
+"""Every command that listens or connects: to its own machine alone, and what else it needs is said before it begins."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Cosim
+
+DOORS = {
+    "run --live": ("run", "no-such-suite", "--live"),
+    "run --director": ("run", "no-such-suite", "--director"),
+    "direct": ("direct", "--listen"),
+    "inject": ("inject", "{}", "--connect"),
+    "listen": ("listen", "--connect"),
+}
+
+
+@pytest.mark.parametrize("door", DOORS)
+def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path: Path) -> None:
+    """Beyond this machine: without TLS, with TLS and no files, with files and no TLS, with files that are not there."""
+    words, beyond, guarded = DOORS[door], "tcp/10.0.0.7:7447", "tls/10.0.0.7:7447"
+    files = str(tmp_path / "none")
+    for more, said in {
+        (beyond,): f"Use {guarded} with --tls FOLDER (`cosim certs` makes it), or say --insecure",
+        (guarded,): f"{guarded} needs --tls FOLDER, which holds ca.pem, cert.pem and key.pem of the role",
+        ("tcp/127.0.0.1:7447", "--tls", files): "--tls goes with tls/ADDRESS:PORT, not with tcp/127.0.0.1:7447",
+        (guarded, "--tls", files): f"{files}/cert.pem: cannot be read: No such file or directory: `cosim certs` makes",
+        (guarded, "--tls", files, "--insecure"): "--tls guards and --insecure does not",
+    }.items():
+        refused = cosim(*words, *more)
+        assert refused.returncode == 2 and said in refused.stderr, refused.stderr
+
+
+def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
+    """On standard error, before anybody is waited for."""
+    tried = cosim("listen", "--connect", "tcp/localhost.:1", "--insecure")
+    (line,) = [line for line in tried.stderr.splitlines() if line.startswith("--insecure: ")]
+    assert "whoever stands between here and tcp/localhost.:1 may read and change all that is sent" in line
+    assert tried.returncode == 3 and "no run is on the air" in tried.stderr
+
+
+def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None:
+    """--tls and --insecure of a run that nobody can reach."""
+    for more in (("--tls", str(tmp_path)), ("--insecure",)):
+        refused = cosim("run", "no-such-suite", *more)
+        assert refused.returncode == 2 and f"{more[0]} goes with --live or --director" in refused.stderr
