@@ -37,6 +37,7 @@ NOSE: Final[Rgb255] = (90, 200, 255)
 VEHICLE: Final[Rgb255] = (60, 80, 130)
 _WALK: Final[Rgb255] = (0, 170, 80)
 RED_SIGNAL: Final[Rgb255] = (220, 30, 30)
+PLANNED: Final[Rgb255] = (15, 163, 177)
 _INK: Final[Rgb255] = (40, 40, 40)
 COLOURS: Final = (PERSON, EVENT, RESIDENT, EVENT)
 """Of people, by their kind."""
@@ -68,8 +69,11 @@ class Minimap:
         self._streets, self._footprint = sheet, np.array(footprint_m)
         self._lights = {c.id: street_map.strips[c.id].line[:, :2] for c in scenario.crossings if c.signalised}
 
-    def picture(self, robot: RobotState, street: Street, size_px: tuple[int, int], ahead: Floats) -> Image:
-        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows more.
+    def picture(
+        self, robot: RobotState, street: Street, size_px: tuple[int, int], ahead: Floats, plan: Floats | None = None
+    ) -> Image:
+        """(height, width, 3) uint8 RGB; size_px: width, height; ahead: (2,) where the map shows more; plan: (N, 2)
+        waypoints that are followed, if any.
 
         People have a nose where they face; those of events are orange, residents green; a hand held up to the robot
         is red. A word says what event people do.
@@ -91,6 +95,9 @@ class Minimap:
         sheet.area(shapely.Polygon(body), ROBOT)
         tip = robot.pose.xy + 0.5 * (body[0] + body[1] - 2.0 * robot.pose.xy)
         sheet.area(shapely.Polygon([tip, 0.5 * (body[0] + body[3]), 0.5 * (body[1] + body[2])]), NOSE)
+        if plan is not None:
+            sheet.line(plan, PLANNED, 0.12)
+            sheet.dot(plan[1:], PLANNED, 0.14)
         return sheet.image
 
     def _ground(self, x0: float, y1: float, px_per_m: float, size_px: tuple[int, int]) -> Image:

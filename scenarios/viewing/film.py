@@ -12,6 +12,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, NamedTuple
 
+import cv2
 import numpy as np
 
 from cosim.core.clock import Clock
@@ -19,18 +20,20 @@ from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, RobotState, Street
 from cosim.core.telling import Tell, untold
+from cosim.episode.following import Following
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
-from cosim.records.record import Record
 from cosim.report import hud
 from cosim.report.legend import Image
-from cosim.report.minimap import Minimap
+from cosim.report.minimap import PLANNED, Minimap
 from cosim.report.video import Video
 from cosim.spec.options import CameraChoice
-from cosim.spec.scenario import Scenario
-from scenarios.execution.places import place
-from scenarios.execution.replay import Alike, check, recorded, replaying
+from cosim.spec.robot import robot_called
+from physics.cameras.view import robot_shot
+from scenarios.execution.places import place, surface_of_place
+from scenarios.execution.replay import Alike, Recorded, check, recorded, replaying
+from scenarios.viewing.drawn_way import way_in_picture
 from scenarios.viewing.look import Viewpoint, eye_behind, over
 
 EASE_S: Final = 0.5
@@ -66,7 +69,7 @@ def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell
     Raises RunError when there is no such episode, or when the replay differs; then there is no file.
     """
     told = recorded(folder, scenario_id)
-    scenario, record, log = told
+    scenario, log = told.scenario, told.log
     if not cut.from_s < cut.to_s:
         raise RunError(f"nothing lies between --from {cut.from_s:g} s and --to {cut.to_s:g} s: give a later --to")
     last = min(len(log), Clock().ticks(min(cut.to_s, 1e6)))
@@ -86,7 +89,7 @@ def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell
         stack.enter_context(episode)
         camera = stack.enter_context(episode.eyes(robot_eye(cut)))
         minimap = Minimap(street_map, scenario, episode.footprint_m)
-        reel = _Reel(scenario, record, minimap, camera, video, cut, last, tell)
+        reel = _Reel(told, minimap, camera, video, cut, last, tell)
         for watch in (Alike(folder, told).watch, reel.take):
             episode.watch(watch)
         observation = episode.reset()
@@ -110,8 +113,7 @@ class _Reel:
 
     def __init__(
         self,
-        scenario: Scenario,
-        record: Record,
+        told: Recorded,
         minimap: Minimap,
         camera: Eyes,
         video: Video,
@@ -119,7 +121,9 @@ class _Reel:
         last: int,
         tell: Tell,
     ) -> None:
-        self._scenario, self._record, self._minimap = scenario, record, minimap
+        self._scenario, self._record, self._minimap = told.scenario, told.record, minimap
+        self._following = Following(told.log)
+        self._plan: Floats | None = None
         self._camera, self._video, self._cut, self._last, self._tell = camera, video, cut, last, tell
         self._counts = {"collision": 0, "out_of_lane": 0, "freezing": 0}
         self._triggered: set[str] = set()
@@ -130,6 +134,7 @@ class _Reel:
     def take(self, step: Step, verdict: Verdict) -> None:
         """One tick of the episode; drawn if it lies within the cut."""
         self._note(step, verdict)
+        self._plan = self._following.take(step, verdict.reset is not None)
         robot = step.motion.robot
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
         share = Clock().tick_s / EASE_S
@@ -146,7 +151,7 @@ class _Reel:
         width, height = self._cut.size
         layout = hud.Layout.of(width, height)
         image: Image = np.zeros((height, width, 3), dtype=np.uint8)
-        seen = self._camera.render(robot, street).rgb
+        seen = self._seen(robot, street)
         if self._cut.view == "robot":
             hud.fill(image, layout.view, seen)
             hud.fill(image, layout.second, self._outside("follow", layout.second, robot, street), "from behind")
@@ -154,7 +159,7 @@ class _Reel:
             hud.fill(image, layout.view, self._outside(self._cut.view, layout.view, robot, street))
             hud.fill(image, layout.second, seen, "robot's camera")
         area = layout.map
-        hud.fill(image, area, self._minimap.picture(robot, street, (area.width, area.height), self._ahead))
+        hud.fill(image, area, self._minimap.picture(robot, street, (area.width, area.height), self._ahead, self._plan))
         time_s = Clock().time_s(step.tick)
         counts = "  ".join(f"{name.replace('_', ' ')} {n}" for name, n in self._counts.items())
         done = step.route_s_after_m / self._scenario.route_line.length_m
@@ -163,6 +168,20 @@ class _Reel:
         if step.tick < self._caption_until:
             hud.caption(image, layout.view, *self._caption)
         return image
+
+    def _seen(self, robot: RobotState, street: Street) -> Image:
+        """What the robot's camera sees, with the waypoints that are followed."""
+        seen = self._camera.render(robot, street).rgb
+        if self._plan is None:
+            return seen
+        surface, spec = surface_of_place(self._scenario.place), robot_eye(self._cut)
+        shot = robot_shot(surface, robot_called(self._scenario.robot), spec, robot)
+        way = way_in_picture(shot, spec.lens, np.column_stack([self._plan, surface.heights(self._plan)]))
+        drawn, wide = seen.copy(), max(2, spec.width // 160)
+        cv2.polylines(drawn, [np.int32(np.round(line)) for line in way.lines], False, PLANNED, wide, cv2.LINE_AA)
+        for x, y in np.round(way.points[1:][np.isfinite(way.points[1:, 0])]).astype(int).tolist():
+            cv2.circle(drawn, (x, y), wide + 1, PLANNED, -1, cv2.LINE_AA)
+        return drawn
 
     def _outside(self, view: Viewpoint, area: hud.Area, robot: RobotState, street: Street) -> Image:
         """What somebody sees who follows the robot, behind it or above it."""

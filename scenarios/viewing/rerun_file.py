@@ -39,7 +39,7 @@ from cosim.judge.referee import Verdict
 from cosim.place.street_map import Lane
 from cosim.report.above import BARRIER, OBSTACLE, ROAD, ROUTE, VERGE
 from cosim.report.legend import Rgb255
-from cosim.report.minimap import COLOURS, RED_SIGNAL, VEHICLE
+from cosim.report.minimap import COLOURS, PLANNED, RED_SIGNAL, VEHICLE
 from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario
@@ -57,7 +57,6 @@ _PICTURES: Final = ("rgb", "depth", "labels")
 _WALK: Final[Rgb255] = (214, 210, 200)
 _CROSSING: Final[Rgb255] = (240, 232, 140)
 _GREEN: Final[Rgb255] = (0, 170, 80)
-_PLANNED: Final[Rgb255] = (15, 163, 177)
 _SPEC: Final = CameraSpec(width=192, height=144, fov_deg=75.0)
 _LABEL_COLOURS: Final = (
     (135, 190, 235), (90, 90, 95), (214, 210, 200), (240, 232, 140), (170, 170, 170), (120, 180, 110), (150, 140, 120),
@@ -254,8 +253,8 @@ class _Tape:
         self._planned = plan
         points = self._on_ground(np.empty((0, 2)) if plan is None else plan, 0.1)
         radii = np.where(np.arange(len(points)) == self._following.follows, 0.1, 0.05)[1:]
-        dots = self._rr.Points3D(points[1:], radii=radii, colors=[_PLANNED])
-        self._log("world/waypoints/line", self._rr.LineStrips3D([points], colors=[_PLANNED], radii=[0.03]))
+        dots = self._rr.Points3D(points[1:], radii=radii, colors=[PLANNED])
+        self._log("world/waypoints/line", self._rr.LineStrips3D([points], colors=[PLANNED], radii=[0.03]))
         self._log("world/waypoints/points", dots)
 
     def _street(self, street: Street, robot: Pose) -> None:

@@ -18,6 +18,7 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.policies.replay import Replay
 from cosim.records.record import Recorder
 from cosim.report.hud import Layout
+from cosim.report.minimap import PLANNED
 from cosim.report.video import Video
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
@@ -42,13 +43,16 @@ def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
         whole, crowd=CrowdSpec(persons=8, radius_m=50.0, vehicles=2), time_limit_s=2.0, robot="courier"
     )
     write_suite(Suite(name="tiny", version="1", scenarios=(short,)), folder / "tiny.json")
-    done = cosim("run", "tiny.json", "--policy", "straight", "--out", "run", cwd=folder)
+    done = cosim("run", "tiny.json", "--policy", "tests.report.blind:Blind", "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
 
 
-def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim) -> None:
-    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play."""
+def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty pictures a second of the cut, in the size asked for, no two neighbours alike, ready to play. The waypoints
+    that are planned from 1 s on are on the map and in the robot's picture."""
+    drawn, add = [], Video.add
+    monkeypatch.setattr(Video, "add", lambda self, image: drawn.append(image.copy()) or add(self, image))
     words = ("film", "run", "t-0", "--from", "1", "--to", "2", "--size", "320x180", "-o", "film.mp4")
     done = cosim(*words, cwd=desk)
     assert done.returncode == 0, done.stderr
@@ -57,6 +61,9 @@ def test_a_film_shows_the_seconds_asked_for(desk: Path, cosim: Cosim) -> None:
     assert len(pictures) == 20 and pictures[0].shape == (180, 320, 3)
     assert all(np.abs(a.astype(int) - b).max() > 10 for a, b in itertools.pairwise(pictures))
     assert not list(desk.glob("*.part"))
+    for area in (Layout.of(320, 180).second, Layout.of(320, 180).map):
+        part = slice(area.y, area.y + area.height), slice(area.x, area.x + area.width)
+        assert all((image[part] == PLANNED).all(axis=2).sum() > 5 for image in drawn)
 
 
 def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> None:
