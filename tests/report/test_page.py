@@ -22,7 +22,7 @@ from cosim.report.page.paper import LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PA
 from cosim.report.page.plots import exposure_of, near_of, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
-from cosim.report.page.three_tables import tables_html
+from cosim.report.page.three_tables import tables_html, warnings_html
 from cosim.spec.scenario import read_suite
 from tests.conftest import ROOT, Cosim
 from tests.records.driven_runs import HIT, episode_of, failure_at, run_of, short_way
@@ -157,6 +157,50 @@ def test_a_run_without_a_failure_stands_at_0_beside_one_with(tmp_path: Path, mon
     (plot,) = [plot for plot in plots_of(runs, colours_of(runs)) if "speed" in plot.title]
     assert {trace["name"]: trace["x"] for trace in plot.figure["data"]} == {HIT: [0.0, 25.641], "goal": [0.0, 0.0]}
     assert not [plot for plot in plots_of(runs[1:], colours_of(runs)) if "speed" in plot.title]
+
+
+def test_long_ways_on_which_a_policy_crashed_are_told_beside_their_rates(tmp_path: Path) -> None:
+    """Two of three crash: their metres are nobody's, the note says how many they are, and who did not crash is not in
+    it."""
+    ways = [short_way(f"s-{k}", ends_on_failure=False, time_limit_s=300.0) for k in range(3)]
+    # 4 m to a failure in each: the rates of a run need 20 m
+    runs = read_runs(
+        [
+            run_of(tmp_path / "shaky", [HIT, "crashed", "crashed"], "shaky", ways),
+            run_of(tmp_path / "sound", [HIT] * 3, "sound", ways),
+        ]
+    )
+    far = {
+        n: msgspec.structs.replace(r, measures=r.measures | {"path_length_m": 50.0})
+        for n, r in runs[0].whole.records.items()
+    }
+    shaky = ReportedRun("shaky", runs[0].whole._replace(records=far))
+    (plot,) = [one for one in plots_of([shaky, runs[1]], colours_of(runs)) if one.title.startswith("What goes wrong")]
+    assert plot.note.endswith("the policy crashed: 2 of 3 of shaky.")
+    (bar,) = plot.figure["data"]
+    assert dict(zip(bar["y"], bar["x"], strict=True)) == {"shaky": 2.0}
+
+
+def test_runs_of_other_scenarios_of_a_suite_are_told_apart(tmp_path: Path) -> None:
+    """One has all three of its scenarios, another two: it is said, with both counts; of two of all nothing."""
+    runs = read_runs([run_of(tmp_path / name, ["goal"] * 3, name) for name in ("one", "other")])
+    assert not warnings_html(runs)
+    first, whole = runs[0], runs[1].whole
+    spec = msgspec.structs.replace(whole.spec, scenarios=whole.spec.scenarios[:2])
+    part = ReportedRun("other", whole._replace(spec=spec, records=dict([*whole.records.items()][:2])))
+    assert "not all runs are of the same scenarios (one 3, other 2)" in warnings_html([first, part])
+
+
+def test_versions_that_differ_stand_side_by_side_and_the_others_once(tmp_path: Path) -> None:
+    """Two runs of one numpy and two of glibc: a line for what is alike, a row for what is not."""
+    runs = read_runs([run_of(tmp_path / name, ["goal"], name) for name in ("one", "other")])
+    told = []
+    for run, glibc in zip(runs, ("2.36", "2.39"), strict=True):
+        spec = msgspec.structs.replace(run.spec, versions={"numpy": "2", "glibc": glibc})
+        told.append(ReportedRun(run.label, run.whole._replace(spec=spec)))
+    text = page_of(told, [], [], Maps([], {}, dict(counts_of(told))), "").decode()
+    assert "<dt>versions</dt><dd>numpy 2</dd>" in text
+    assert '<th scope="row">glibc</th><td>2.36</td><td>2.39</td>' in text
 
 
 def test_the_table_of_places_counts_failures_that_the_map_has_no_room_for(tmp_path: Path) -> None:

@@ -27,14 +27,15 @@ WIDE = "document.documentElement.scrollWidth"
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
-    """The report of a run of two scenarios that a blind policy fails."""
+    """The report of a run of two scenarios that a blind policy fails, in place of a file that was there."""
     folder = tmp_path_factory.mktemp("report")
     words = ("--policy", "tests.report.blind:Blind", "--scenario", "lateral-001", "--scenario", "obstructing-001")
     done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
+    (folder / "report.html").write_text("another page")
     done = cosim("report", "run", "--jobs", "1", "-o", "report.html", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "2 of 2 failures" in done.stdout
+    assert "2 of 2 failures), in place of the one that was there" in done.stdout
     return folder / "report.html"
 
 

@@ -29,20 +29,48 @@ def person(fault: str = "robot_at_fault", speed_mps: float = 1.2) -> Failure:
     return Failure("collision", 79, 4.0, 0.0, 4.0, speed_mps, "e0", "pedestrian", fault)  # type: ignore[arg-type]
 
 
+def car(speed_mps: float = 1.2) -> Failure:
+    return Failure("collision", 79, 4.0, 0.0, 4.0, speed_mps, "v0", "vehicle")
+
+
 @pytest.mark.parametrize(
     ("failure", "other", "words"),
     [
         (person(), Other(0.6, 0.4, 0.0, -1.2), "drove into a person who came from the left at 1.2 m/s"),
         (person(), Other(0.6, -0.4, 0.0, 0.8), "drove into a person who came from the right at 0.8 m/s"),
-        (person("shared"), Other(0.7, 0.0, -1.4, 0.1), "ran into a person who came from the front at 1.4 m/s"),
+        (person("shared"), Other(0.7, 0.0, -1.4, 0.1), "collided with a person who came from the front at 1.4 m/s"),
         (person(), Other(0.7, 0.0, 0.6, 0.0), "drove into a person who went ahead of it at 0.6 m/s"),
-        (person(), Other(-0.7, 0.0, 1.6, 0.0), "drove into a person who came from behind at 1.6 m/s"),
+        (person(), Other(-0.7, 0.0, 1.6, 0.0), "collided with a person who came from behind at 1.6 m/s"),
         (person(), Other(0.6, 0.1, 0.0, 0.0), "drove into a person who stood ahead, at 1.2 m/s"),
         (person(speed_mps=0.0), Other(0.0, 0.7, 0.0, -1.0), "was hit by a person who came from the left at 1.0 m/s"),
+        (person(speed_mps=0.0), Other(0.0, 0.7, 0.0, 0.1), "touched a person who stood to the left, both at rest"),
+        (person(speed_mps=0.0), Other(0.6, 0.0, 0.5, 0.0), "touched a person who went ahead of it at 0.5 m/s"),
+        (car(), Other(1.5, 0.0, 0.0, 5.0), "collided with a vehicle that came from the right at 5.0 m/s"),
+        (car(), Other(1.5, 0.0, 0.0, 0.0), "drove into a vehicle that stood ahead, at 1.2 m/s"),
+        (car(0.0), Other(0.0, 2.0, 0.0, -5.0), "was hit by a vehicle that came from the left at 5.0 m/s"),
+        (car(), None, "ran into a vehicle at 1.2 m/s"),
+        (car(0.0), None, "was touched by a vehicle where it stood"),
     ],
-    ids=["left", "right", "front", "ahead", "behind", "stood", "was hit"],
+    ids=[
+        "left",
+        "right",
+        "front",
+        "ahead",
+        "behind",
+        "stood",
+        "was hit",
+        "both stood",
+        "goes away",
+        "vehicle",
+        "parked vehicle",
+        "hit by vehicle",
+        "vehicle unseen",
+        "vehicle unseen, stood",
+    ],
 )
-def test_a_collision_tells_from_where_and_how_fast_the_other_came(failure: Failure, other: Other, words: str) -> None:
+def test_a_collision_tells_from_where_and_how_fast_the_other_came(
+    failure: Failure, other: Other | None, words: str
+) -> None:
     """Sides are the robot's, its left is y > 0; who does not move stood; who is slower ahead went ahead."""
     assert told(failure, other) == words
 
@@ -85,12 +113,19 @@ def test_an_episode_without_a_failure_of_the_referees_has_a_reason() -> None:
     ended = {
         "timeout": ("out of time", "ran out of time after 12 s, with 40 % of the route done"),
         "failure": ("broke the rule", "passed the person who held out a stopping hand"),
-        "goal": ("broke the rule", "came to the goal, but went between people of a group it should have passed round"),
+        "goal": (
+            "broke the rule",
+            "came to the goal, but went between people of a group that it should have passed round",
+        ),
     }
     for how, (cause, words) in ended.items():
         one = msgspec.structs.replace(lost, ended=how)
         (mishap,) = mishaps_of(one)
         assert (mishap.cause, reason_of(WAY, one, mishap, log)) == (cause, words)
+    queue = TriggeredEvent(id="e0", kind="queueing", passed=True, rule_met=False)
+    through = msgspec.structs.replace(lost, ended="goal", events=(queue,))
+    words = reason_of(WAY, through, mishaps_of(through)[0], log)
+    assert words == "came to the goal, but went through a queue that it should have passed round"
     crashed, _ = episode_of(WAY, "h", "crashed")
     assert reason_of(WAY, crashed, mishaps_of(crashed)[0], None) == "the policy crashed: it said so"
 

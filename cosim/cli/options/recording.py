@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from pathlib import Path
 
-from cosim.cli.options.output_file import check_output
+from cosim.cli.options.output_file import check_output, replaced
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import MachineError, UsageError
@@ -33,7 +33,8 @@ def write_rerun(folder: Path, episodes: list[str], path: Path | None) -> None:
         return
     from scenarios.viewing.rerun_file import record_for_rerun
 
+    instead = replaced(path)
     with doing(f"recording {episodes[0]}") as tell:
         record_for_rerun(folder, episodes[0], path, tell=tell)
     size = f"{path.stat().st_size / 1e6:.1f} MB, the state hash is the record's"
-    out.print(f"Recording: {path} ({size}). Open it with: rerun {path}", soft_wrap=True, highlight=False)
+    out.print(f"Recording: {path} ({size}){instead}. Open it with: rerun {path}", soft_wrap=True, highlight=False)

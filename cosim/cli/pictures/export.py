@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from cosim.cli.options.output_file import check_output
+from cosim.cli.options.output_file import check_output, replaced
 from cosim.cli.options.panels import LOOK
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
@@ -29,7 +29,8 @@ def export(
     from scenarios.viewing.export import export_street
 
     (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])
+    instead = replaced(output)
     with doing("reading the scenario") as tell:
         tiles = export_street(one, output, tell)
     size = f"{tiles} tiles, {output.stat().st_size / 1e6:.1f} MB"
-    out.print(f"Street: {output} ({one.id}, {size})", soft_wrap=True, highlight=False)
+    out.print(f"Street: {output} ({one.id}, {size}){instead}", soft_wrap=True, highlight=False)

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
+from cosim.cli.options.output_file import replaced
 from cosim.cli.options.panels import LOOK
 from cosim.cli.pictures.view import size_of, view_of
 from cosim.cli.terminal.consoles import out
@@ -38,10 +39,11 @@ def film(
 
     picked = view_of(view)
     until_s = math.inf if end is None else end
+    instead = replaced(output)
     with doing("choosing the camera") as tell:
         cut = Cut(start, until_s, size_of(size), speed, camera_here(camera), picked)
         to_s = make_film(folder, episode, output, cut, tell)
     same = (
         "the state hash is the record's" if to_s == math.inf else f"of its first {to_s:g} s every tick is as recorded"
     )
-    out.print(f"Film: {output} ({same})", soft_wrap=True, highlight=False)
+    out.print(f"Film: {output} ({same}){instead}", soft_wrap=True, highlight=False)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
-from cosim.cli.options.output_file import check_output
+from cosim.cli.options.output_file import check_output, replaced
 from cosim.cli.options.panels import LOOK
 from cosim.cli.options.street import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP, RESIDENTS_HELP, ROBOT_HELP
 from cosim.cli.pictures.view import size_of, view_of
@@ -52,8 +52,9 @@ def look(
     (one,) = scenarios_chosen(whole, [scenario])
     with doing("choosing the camera") as tell:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)
+    instead = replaced(output)
     _save(image, output)
-    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view})", soft_wrap=True, highlight=False)
+    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view}){instead}", soft_wrap=True, highlight=False)
 
 
 def _save(image: object, path: Path) -> None:

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
+from cosim.cli.options.output_file import replaced
 from cosim.cli.terminal.consoles import err, out
 from cosim.cli.terminal.progress import doing
 from cosim.core.box import box_of, refuse_outside
@@ -120,12 +121,13 @@ def draw_city(
 
     part = (0.0, 0.0, size, size) if zoom is None else box_of("--zoom", zoom, "x0,y0,x1,y1")
     city = City(seed=seed, size_m=size, style=style)
+    instead = replaced(picture)
     with doing(f"building {city.name}") as tell:
         street_map = street_map_of(city_net(city))
         refuse_outside("--zoom", part, street_map.bounds)
         tell("drawing")
         write_png(_picture(street_map, part), picture)
-    out.print(f"Picture: {picture}", soft_wrap=True)
+    out.print(f"Picture: {picture}{instead}", soft_wrap=True)
 
 
 def print_cities(found: Sequence[Survey]) -> None:

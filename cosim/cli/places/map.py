@@ -12,6 +12,7 @@ from rich import box
 from rich.markup import escape
 from rich.table import Table
 
+from cosim.cli.options.output_file import replaced
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
 from cosim.core.box import box_of, refuse_outside
@@ -76,6 +77,7 @@ def report_map_check(
     part = None if zoom is None else box_of("--zoom", zoom)
     if part is not None and picture is None:
         raise UsageError("--zoom is for the picture: say where to write it with -o")
+    instead = replaced(picture)
     with doing(f"checking {place}") as tell:
         street_map, found, about = _look_up(place)
         if picture is not None:
@@ -91,7 +93,7 @@ def report_map_check(
     else:
         print_check(found, about)
         if picture is not None:
-            out.print(f"Picture: {picture}", soft_wrap=True)
+            out.print(f"Picture: {picture}{instead}", soft_wrap=True)
     if not found.usable:
         raise typer.Exit(WRONG_USE)
 

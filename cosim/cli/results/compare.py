@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
+from cosim.cli.options.output_file import replaced
 from cosim.cli.options.panels import TRUST
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
@@ -44,6 +45,7 @@ def compare(
             raise UsageError(f"{path}: its name must end in .csv, {', '.join(FORMATS)}: so the format is chosen")
     with doing(f"comparing {len(folders)} runs"):
         told = compare_runs(folders)
+    instead = {path: replaced(path) for path in outputs or ()}
     for path in outputs or ():
         if path.suffix == ".csv":
             _write(path, told.differences.to_csv(index=False))
@@ -51,8 +53,8 @@ def compare(
         else:
             _write(path, FORMATS[path.suffix](told))
     print_comparison(out, told)
-    for path in outputs or ():
-        out.print(f"Written: {path}", soft_wrap=True, markup=False, highlight=False)
+    for path, said in instead.items():
+        out.print(f"Written: {path}{said}", soft_wrap=True, markup=False, highlight=False)
 
 
 def print_comparison(out: Console, told: RunComparison) -> None:

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
-from cosim.cli.options.output_file import check_output
+from cosim.cli.options.output_file import check_output, replaced
 from cosim.cli.options.panels import LOOK
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
@@ -37,8 +37,9 @@ def report(
     check_output(output, "a page", (".html", ".htm"))
     from scenarios.viewing.report import make_report
 
+    instead = replaced(output)
     with doing("choosing the camera") as tell:
         drawn_by = camera_here(camera)
         made = make_report(folders, output, camera=drawn_by, jobs=jobs, most=failures, tell=tell)
     size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
-    out.print(f"Report: {output} ({size})", soft_wrap=True, highlight=False)
+    out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)

@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
+from cosim.cli.options.output_file import replaced
 from cosim.cli.options.recording import RERUN_HELP, write_rerun
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
@@ -74,9 +75,10 @@ def show(
         raise UsageError(f"episode '{episode}' is {record.status}: it has no track to draw. Leave -o out")
     if record.ended is not None:
         path = picture or folder / "episodes" / episode / "above.png"
+        instead = replaced(picture)
         with doing(f"drawing {episode}"):
             draw_episode(folder, episode, path)
-        out.print(f"Picture: {path}", soft_wrap=True)
+        out.print(f"Picture: {path}{instead}", soft_wrap=True)
 
 
 def print_episode(out: Console, record: Record) -> None:

@@ -15,6 +15,7 @@ from rich.table import Column, Table
 
 from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
 from cosim.cli.options.latency import LATENCY_HELP, REAL_TIME_HELP, asked_latency_ms, with_latency
+from cosim.cli.options.output_file import replaced
 from cosim.cli.options.recording import RERUN_HELP, check_rerun, write_rerun
 from cosim.cli.terminal.board import Board
 from cosim.cli.terminal.consoles import err, out
@@ -148,6 +149,7 @@ def draw_own(
     if scenario is not None and scenario not in variants:
         raise unknown("scenario", scenario, variants)
     variant = variants[scenario] if scenario else own.variants[0]
+    instead = replaced(picture)
     with doing(f"drawing {variant.id}"):
         made = made_one(variant, own.name)
         if made.scenario is None and not whole and part is None:
@@ -159,7 +161,7 @@ def draw_own(
         write_png(draw_plan(street_map, made.scenario, whole=whole, part=part), picture)
     for fault in made.faults:
         err.print(f"{file}: {fault}", soft_wrap=True, markup=False, highlight=False)
-    out.print(f"Picture: {picture}", soft_wrap=True)
+    out.print(f"Picture: {picture}{instead}", soft_wrap=True)
     if made.faults:
         raise typer.Exit(WRONG_USE)
 

@@ -17,7 +17,7 @@
   for (const place of all("[data-plot]")) {
     const { data: traces, layout } = data.plots[Number(place.dataset.plot)];
     const xaxis = { ...axis, ...layout.xaxis, title: { ...axis.title, ...(layout.xaxis.title || {}) } };
-    const shown = { ...base, ...layout, xaxis, yaxis: { ...axis, ...layout.yaxis } };
+    const shown = { ...base, ...layout, xaxis, yaxis: { ...axis, ticks: "outside", ticklen: 6, tickcolor: "#fff", ...layout.yaxis } };
     Plotly.newPlot(place, traces.map((t) => ({ ...t, hovertemplate: `${t.hovertemplate}<extra>${t.name}</extra>` })), shown, config);
   }
   // Plotly reads a few tags in its texts; names are to be seen as they are.
@@ -246,7 +246,7 @@
   function map() {
     const picture = data.maps.pictures[Number(chooser.value)], spots = data.maps.spots[picture.place] || [];
     one("#map-name").textContent = picture.place;
-    const [x0, y0, x1, y1] = picture.bounds, causes = [...new Set(spots.map((s) => s.cause))];
+    const [x0, y0, x1, y1] = picture.bounds, causes = Object.keys(data.causes).filter((cause) => spots.some((s) => s.cause === cause));
     const traces = causes.map((cause) => {
       const of = spots.filter((s) => s.cause === cause);
       return { type: "scatter", mode: "markers", name: cause, x: of.map((s) => s.x_m), y: of.map((s) => s.y_m),

@@ -187,6 +187,13 @@ def _what_was_run(runs: Sequence[ReportedRun]) -> str:
     """What each run was, so that somebody else can do it again: what they share once, the rest side by side."""
     facts = [_facts(run) for run in runs]
     shared = {name: value for name, value in facts[0].items() if all(one[name] == value for one in facts)}
+    versions = [run.spec.versions for run in runs]
+    packages = sorted({name for one in versions for name in one})
+    alike = [name for name in packages if len({one.get(name) for one in versions}) == 1]
+    if alike:
+        shared["versions"] = ", ".join(f"{name} {versions[0][name]}" for name in alike)
+    for fact, one in zip(facts, versions, strict=True):
+        fact |= {name: one.get(name, "not told") for name in packages if name not in alike}
     parts = [_listing(shared)] if shared else []
     if differing := [name for name in facts[0] if name not in shared]:
         heads = "".join(f'<th scope="col">{escape(run.label)}, {escape(run.spec.suite)}</th>' for run in runs)
@@ -224,7 +231,6 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "seed of the run": str(spec.seed),
         "wall time": wall,
         "folder": str(run.path),
-        "versions": ", ".join(f"{name} {number}" for name, number in sorted(spec.versions.items())),
     }
 
 

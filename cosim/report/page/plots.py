@@ -176,6 +176,7 @@ def _points(
         data.append(
             {
                 "type": "scatter", "mode": "markers", "orientation": "h", "name": escape(label), "offsetgroup": label,
+                "cliponaxis": False,
                 "x": [round(cell.mean, 4) for _, cell in shown], "y": [word for word, _ in shown],
                 "error_x": {
                     "type": "data", "symmetric": False, "thickness": 1.6, "width": 0,
@@ -201,19 +202,19 @@ def _points(
 
 
 def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> dict[str, Any]:
-    """A bar for each row, made of causes."""
+    """A bar for each row, made of causes. rows: by their names as Plotly shows them."""
     causes = [cause for cause in CAUSE_COLOURS if any(row.get(cause) for row in rows.values())]
     data = [
         {
             "type": "bar", "orientation": "h", "name": cause, "marker": {"color": CAUSE_COLOURS[cause]},
-            "y": [escape(row) for row in rows],
+            "y": [*rows],
             "x": [round(row.get(cause, 0.0), 4) for row in rows.values()],
             "hovertemplate": f"{cause}: %{{x:{form}}}",
         }
         for cause in causes
     ]  # fmt: skip
     yaxis = {"autorange": "reversed", "type": "category"}
-    layout = {"barmode": "stack", "height": 140 + 34 * len(rows), "bargap": 0.35, "showlegend": True, "yaxis": yaxis}
+    layout = {"barmode": "stack", "height": 140 + 40 * len(rows), "bargap": 0.35, "showlegend": True, "yaxis": yaxis}
     return {
         "data": data,
         "layout": layout | {"xaxis": {"title": {"text": axis}, "tickformat": form, "zeroline": False}},
@@ -227,7 +228,7 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
         for record in run.records:
             family = table_of_paper(run.scenarios[record.scenario])
             if family != "long":
-                row = rows.setdefault(f"{run.label}, {_FAMILIES[family]}", {})
+                row = rows.setdefault(f"{escape(run.label)}<br>{_FAMILIES[family]}", {})
                 went = mishaps_of(record)
                 what = "invalid" if record.status == "invalid" else went[0].cause if went else "success"
                 row[what] = row.get(what, 0.0) + 1.0
@@ -239,23 +240,29 @@ def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
 
 
 def _rates_by_cause(runs: Sequence[ReportedRun]) -> Plot | None:
-    """What goes wrong on long ways."""
+    """What goes wrong on long ways. An episode whose policy crashed has no metres: it is told beside."""
     counts: dict[str, dict[str, float]] = {}
     metres: dict[str, float] = {}
+    crashed: dict[str, list[bool]] = {}
     for run in runs:
         for record in run.records:
-            if table_of_paper(run.scenarios[record.scenario]) == "long" and record.status == "done":
+            if table_of_paper(run.scenarios[record.scenario]) != "long":
+                continue
+            crashed.setdefault(run.label, []).append(record.status == "crashed")
+            if record.status == "done":
                 metres[run.label] = metres.get(run.label, 0.0) + (record.measures.get("path_length_m") or 0.0)
                 row = counts.setdefault(run.label, {})
                 for mishap in mishaps_of(record):
                     if mishap.failure is not None:
                         row[mishap.cause] = row.get(mishap.cause, 0.0) + 1.0
     rows = {
-        label: {cause: 100.0 * n / metres[label] for cause, n in row.items()}
+        escape(label): {cause: 100.0 * n / metres[label] for cause, n in row.items()}
         for label, row in counts.items()
         if metres[label] >= _LEAST_M
     }
     if not any(rows.values()):
         return None
     note = "Failures per 100 m, all metres of episodes that ended. After a failure the robot is put back and goes on."
+    told = [f"{sum(which)} of {len(which)} of {label}" for label, which in crashed.items() if any(which)]
+    note += f" Not in it are the episodes in which the policy crashed: {', '.join(told)}." if told else ""
     return Plot("What goes wrong on long ways", note, _stacked(rows, "failures per 100 m", ".1f"))

@@ -115,21 +115,23 @@ def event_of(scenario: Scenario, mishap: Mishap) -> Event | None:
 
 
 def _met(failure: Failure, other: Other | None, whom: str) -> str:
-    """A collision with somebody who moves, or who stood."""
+    """A collision with somebody who moves, or who stood. The speed that is told is the other's, or the robot's where
+    the other stood."""
     stood = failure.robot_speed_mps < _STANDS_MPS
-    verb = "was hit by" if stood else "drove into" if failure.fault != "shared" else "ran into"
+    at = "where it stood" if stood else f"at {failure.robot_speed_mps:.1f} m/s"
     if other is None:
-        return f"{verb} {whom} at {failure.robot_speed_mps:.1f} m/s"
+        return f"{'was touched by' if stood else 'ran into'} {whom} {at}"
     speed_mps = math.hypot(other.vx_mps, other.vy_mps)
-    thing = "who" if whom == "a person" else "that"
+    whom += " who" if whom == "a person" else " that"
     if speed_mps < _STANDS_MPS:
-        return (
-            f"{verb} {whom} {thing} stood {_side(other.x_m, other.y_m, 'ahead')}, at {failure.robot_speed_mps:.1f} m/s"
-        )
+        where = _side(other.x_m, other.y_m, "ahead")
+        return f"touched {whom} stood {where}, both at rest" if stood else f"drove into {whom} stood {where}, {at}"
     side = _side(-other.vx_mps, -other.vy_mps, "from the front", "from the ", "from behind")
     if side == "from behind" and other.x_m > 0.0:
-        return f"{verb} {whom} {thing} went ahead of it at {speed_mps:.1f} m/s"
-    return f"{verb} {whom} {thing} came {side} at {speed_mps:.1f} m/s"
+        return f"{'touched' if stood else 'drove into'} {whom} went ahead of it at {speed_mps:.1f} m/s"
+    alike = failure.fault == "shared" or failure.other_kind == "vehicle" or side == "from behind"
+    verb = "was hit by" if stood else "collided with" if alike else "drove into"
+    return f"{verb} {whom} came {side} at {speed_mps:.1f} m/s"
 
 
 def _side(x: float, y: float, front: str, aside: str = "to the ", behind: str = "behind") -> str:
@@ -190,9 +192,11 @@ def _ended(scenario: Scenario, record: Record) -> str:
     """An episode that failed without a failure of the referee's."""
     done = 100.0 * (record.measures.get("route_completion") or 0.0)
     if record.ended == "goal":
-        return "came to the goal, but went between people of a group it should have passed round"
+        broken = {event.kind for event in record.events if event.rule_met is False}
+        what = "through a queue" if broken == {"queueing"} else "between people of a group"
+        return f"came to the goal, but went {what} that it should have passed round"
     if record.ended == "failure":
         return "passed the person who held out a stopping hand"
     if scenario.ends_at == "stop":
-        return f"did not stop for the stopping hand within {scenario.time_limit_s:.0f} s"
+        return f"made no stop before the stopping hand within {scenario.time_limit_s:.0f} s"
     return f"ran out of time after {scenario.time_limit_s:.0f} s, with {done:.0f} % of the route done"

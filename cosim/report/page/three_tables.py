@@ -178,7 +178,9 @@ def _framed(
         cells = "".join(_cell(cell_of(_part(table, c), c.metric), edge[k]) for k, c in enumerate(columns))
         body.append(f'<tr><th scope="row">{escape(label)}{_marks(table)}</th>{cells}</tr>')
     if paper:
-        body.append(f'<tr class="divide"><th colspan="{len(columns) + 1}" scope="rowgroup">{_BESIDE}</th></tr>')
+        body.append(
+            f'<tr class="divide"><th colspan="{len(columns) + 1}" scope="rowgroup"><span>{_BESIDE}</span></th></tr>'
+        )
     for name, row in paper.items():
         cells = "".join(f"<td{edge[k]}>{_number(value)}</td>" for k, value in enumerate(row))
         body.append(f'<tr class="paper"><th scope="row">{escape(name)}</th>{cells}</tr>')
@@ -237,12 +239,23 @@ def _number(value: float | None) -> str:
     return "&ndash;" if value is None else f"{value:.2f}"
 
 
-def warnings_html(runs: Iterable[ReportedRun]) -> str:
-    """Why figures of a run are not to be quoted, a line for each such run; nothing where all are sound."""
+def warnings_html(runs: Sequence[ReportedRun]) -> str:
+    """Why figures of a run are not to be quoted, a line for each such run, and which runs of a suite are of other
+    scenarios of it; nothing where all are sound."""
     told = [(run, not_to_be_quoted(run.table, len(run.spec.scenarios))) for run in runs]
     lines = [
         f"<li><b>{escape(run.label)}, {escape(run.spec.suite)}</b>: not to be quoted, {escape(why)}.</li>"
         for run, why in told
         if why
     ]
+    suites: dict[str, list[ReportedRun]] = {}
+    for run in runs:
+        suites.setdefault(run.spec.suite, []).append(run)
+    for suite, of in suites.items():
+        if len({frozenset(run.spec.scenarios) for run in of}) > 1:
+            counts = ", ".join(f"{escape(run.label)} {len(run.spec.scenarios)}" for run in of)
+            lines.append(
+                f"<li><b>{escape(suite)}</b>: not all runs are of the same scenarios ({counts}). Their rows are not to "
+                "be compared one with another; <code>cosim compare</code> takes the scenarios that both have.</li>"
+            )
     return f'<ul class="warn">{"".join(lines)}</ul>' if lines else ""
