@@ -30,6 +30,8 @@ _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 """In zenoh's errors: where it was built, of no use to anybody here."""
 
 _ANSWER = "answer"
+_WRITTEN = ("zenoh/bytes", "application/msgpack", "application/json", "text/json", "text/plain", "zenoh/string")
+"""How a message may say that it is written: as none that makes objects of any kind."""
 _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
 
@@ -71,18 +73,6 @@ class Session:
         assert self._inside is not None, "this session listens nowhere"
         return self._inside
 
-    @classmethod
-    def hub(cls, listen: str) -> Session:
-        """The centre of a star: listens at an endpoint such as `unixsock-stream//tmp/a.sock`."""
-        remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
-        return cls(_open("router", [listen], [], f"cannot listen at {listen}", remedy, {}))
-
-    @classmethod
-    def client(cls, connect: str) -> Session:
-        """A session that connects to a hub; it opens no port of its own."""
-        remedy = "Is a process started that listens there, and is the endpoint the same?"
-        return cls(_open("client", [], [connect], f"no hub answers at {connect}", remedy, {}))
-
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
 
@@ -92,14 +82,13 @@ class Session:
 
         def answer(query: zenoh.Query) -> None:
             with query:
-                asked = str(query.key_expr)
-                many = "*" in asked
-                if many and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
-                    query.reply_err(f"ask for exactly '{key}', not '{asked}'".encode())
+                if objection := _objection(query, key, found=found):
+                    query.reply_err(objection.encode())
                     return
                 payload = query.payload.to_bytes() if query.payload is not None else b""
+                asked = str(query.key_expr)
                 try:
-                    query.reply(key if many else asked, handler(payload))
+                    query.reply(key if "*" in asked else asked, handler(payload))
                 except Exception as error:  # noqa: BLE001  a silent callback would look like a lost peer
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
@@ -164,6 +153,18 @@ class Session:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+
+def _objection(query: zenoh.Query, key: str, *, found: bool) -> str:
+    """What is against answering a query on a key, "" for nothing: it asks several at once, or would have us unpickle.
+
+    found: whether several may be asked at once."""
+    asked, written = str(query.key_expr), str(query.encoding or _WRITTEN[0])
+    if "*" in asked and not (found and query.key_expr.includes(zenoh.KeyExpr(key))):
+        return f"ask for exactly '{key}', not '{asked}'"
+    if written not in _WRITTEN:
+        return f"'{written[:64]}' is not read here: send {_WRITTEN[1]} or {_WRITTEN[2]}"
+    return ""
 
 
 class LoneSession(Session):

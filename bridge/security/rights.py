@@ -26,14 +26,14 @@ class _Rights(NamedTuple):
 
 
 RIGHTS: Final[dict[Role, _Rights]] = {
-    "coordinator": _Rights("ask policies and directors", ask=("cosim/*/policy/*/*", f"{_ENV}/director")),
+    "coordinator": _Rights("ask policies and directors", ask=("cosim/*/policy/**", f"{_ENV}/director")),
     "director": _Rights("nothing elsewhere"),
     "worker": _Rights(
         "take episodes and tell their results, ask policies and directors",
-        ask=("cosim/*/jobs/*", "cosim/*/nets/*", "cosim/*/policy/*/*", f"{_ENV}/director"),
+        ask=("cosim/*/status", "cosim/*/jobs/*", "cosim/*/nets/*", "cosim/*/policy/**", f"{_ENV}/director"),
         show=("cosim/*/workers/*",),
     ),
-    "policy": _Rights("answer as a policy", answer=("cosim/*/policy/*/*",)),
+    "policy": _Rights("answer as a policy", answer=("cosim/*/policy/**",)),
     "viewer": _Rights(
         "watch",
         ask=("cosim/*/status", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
@@ -48,8 +48,8 @@ _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
 }
 """Whom a hub has business with."""
 _LARGEST_B: Final = {
-    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim", "cosim/*/jobs/renew", "cosim/*/jobs/failed"),
-    1 << 20: (f"{_ENV}/director",),
+    64 << 10: (f"{_ENV}/inject", "cosim/*/jobs/claim"),
+    1 << 20: (f"{_ENV}/director", "cosim/*/jobs/failed"),
     1 << 10: ("cosim/*/status", "cosim/*/nets/*", *(f"{_ENV}/{key}" for key in ("status", "log", "camera"))),
 }
 """Longer messages are dropped unread. All others are bounded by what a session takes at all."""

@@ -60,7 +60,8 @@ import msgspec
 from bridge import keys
 from bridge.codec import decode, encode
 from bridge.director import opened_query, signed
-from bridge.session import Session
+from bridge.session import open_session
+from cosim.spec.connection import Connection
 from scenarios.events import react
 from scenarios.execution.directing import behaviours
 
@@ -79,7 +80,7 @@ def lie(payload):
         case "huge": return signed(reply, "x" * 10_000_000)
     raise RuntimeError("no idea")
 
-with Session.hub(sys.argv[1]) as hub:
+with open_session(Connection(role="director", listen=sys.argv[1])) as hub:
     hub.serve(keys.EVERY_DIRECTOR, lie)
     print("lying", flush=True)
     time.sleep(3600)

@@ -15,10 +15,11 @@ import pytest
 from bridge import keys
 from bridge.codec import decode, encode
 from bridge.director import QueryParts, RemoteDirector, opened_query, serve_director, signed, signed_query
-from bridge.session import LoneSession, Session
+from bridge.session import LoneSession
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
 from cosim.spec.events import Actor, Event, EventQuery, EventReply, EventState, Walker
+from tests.bridge.ends import connected_to, listening_at
 from tests.conftest import PATIENCE_S
 
 pytestmark = pytest.mark.engine
@@ -43,7 +44,7 @@ def endpoint(folder: Path) -> str:
 
 def test_every_tick_is_answered_in_lockstep(tmp_path: Path) -> None:
     """A thousand queries get a thousand replies, each to its own tick."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
         director = RemoteDirector(client, KEY)
         assert [director.react(query(tick)).tick for tick in range(1000)] == list(range(1000))
@@ -102,7 +103,7 @@ def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> No
     def broken(asked: EventQuery) -> EventReply:
         raise RuntimeError("no idea")
 
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, broken)
         with pytest.raises(DirectorLost, match=r"tick 7 of 't'.*RuntimeError: no idea"):
             RemoteDirector(client, KEY).react(query(7))
@@ -110,7 +111,7 @@ def test_a_director_that_raises_is_reported_with_its_words(tmp_path: Path) -> No
 
 def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
     """Nobody on the key: asked again until the time is over, then an error that says so."""
-    with Session.hub(endpoint(tmp_path)), Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)), connected_to(endpoint(tmp_path)) as client:
         began = time.monotonic()
         with pytest.raises(DirectorLost, match=r"nobody answered .* for 0\.5 s"):
             RemoteDirector(client, KEY, wait_s=0.5).react(query())
@@ -119,17 +120,17 @@ def test_a_missing_director_is_waited_for_and_then_lost(tmp_path: Path) -> None:
 
 def test_a_director_that_restarts_is_found_again(tmp_path: Path) -> None:
     """The director's session closes and another takes its place: the next query is answered."""
-    with Session.hub(endpoint(tmp_path)), Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)), connected_to(endpoint(tmp_path)) as client:
         director = RemoteDirector(client, KEY)
         for tick in range(3):
-            with Session.client(endpoint(tmp_path)) as server:
+            with connected_to(endpoint(tmp_path)) as server:
                 serve_director(server, KEY, echo)
                 assert director.react(query(tick)).tick == tick
 
 
 def test_an_answer_to_another_tick_is_refused(tmp_path: Path) -> None:
     """A reply that belongs to another tick or episode is a protocol error."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, lambda asked: EventReply(episode="t", tick=asked.tick + 1, states=(), actors=()))
         with pytest.raises(DirectorLost, match="answered tick 1"):
             RemoteDirector(client, KEY).react(query(0))
@@ -168,7 +169,7 @@ def test_a_reply_that_cannot_be_meant_is_refused_in_words(tmp_path: Path, fields
     """The last tick's, another episode's, too many states, people of nobody, places that are none."""
     asked = msgspec.structs.replace(query(5), events=(event(),))
     sane = EventReply(episode="t", tick=5, states=(SANE,), actors=(SHOWN,))
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, lambda _: msgspec.structs.replace(sane, **fields if asked.states else {}))
         director = RemoteDirector(client, KEY)
         assert director.react(asked) == sane
@@ -180,7 +181,7 @@ def test_a_reply_that_cannot_be_meant_is_refused_in_words(tmp_path: Path, fields
 @pytest.mark.parametrize("theirs", ["feed", ""])
 def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) -> None:
     """Whatever it would do: both ends sign with their version, and each refuses the other's."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo, by=theirs)
         with pytest.raises(DirectorLost, match=f"'cafe' met behaviours '{theirs}': .* from the same code"):
             RemoteDirector(client, KEY, by="cafe").react(query())
@@ -192,7 +193,7 @@ def test_a_director_of_other_behaviours_is_refused(tmp_path: Path, theirs: str) 
 
 def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
     """Served on a key with wildcards it answers any concrete one, and still no wildcard query."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, keys.EVERY_DIRECTOR, echo)
         for run, env in (("a", "x"), ("b", "y")):
             assert RemoteDirector(client, keys.director(run, env)).react(query(2)).tick == 2
@@ -203,7 +204,7 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
 def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> None:
     """Once, after two seconds; the director that comes then is taken."""
     told: list[str] = []
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
 
         def waiting(words: str) -> None:
             told.append(words)
@@ -220,7 +221,7 @@ def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> N
 )
 def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None:
     """Broken, huge-length, deeply nested and pickled payloads get an error reply; the next query works."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
         with pytest.raises(EngineError, match=r"not a (Signed|QueryParts) message"):
             client.ask(KEY, payload, timeout_s=PATIENCE_S)
@@ -229,7 +230,7 @@ def test_garbage_is_refused_without_harm(tmp_path: Path, payload: bytes) -> None
 
 def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
     """A query for every environment at once is refused: each director answers its own key."""
-    with Session.hub(endpoint(tmp_path)) as hub, Session.client(endpoint(tmp_path)) as client:
+    with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
         serve_director(hub, KEY, echo)
         with pytest.raises(EngineError, match=f"ask for exactly '{KEY}'"):
             client.ask("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
@@ -238,7 +239,7 @@ def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
 def test_nobody_to_connect_to_is_an_error_with_the_endpoint(tmp_path: Path) -> None:
     """A client without a hub fails and names the endpoint."""
     with pytest.raises(EngineError, match="no hub answers at unixsock-stream"):
-        Session.client(endpoint(tmp_path))
+        connected_to(endpoint(tmp_path))
 
 
 def test_names_that_cannot_stand_in_a_key_are_refused() -> None:

@@ -12,6 +12,7 @@ import pytest
 from bridge.live import serve_injections
 from bridge.session import Session
 from cosim.spec.injection import Ack
+from tests.bridge.ends import listening_at
 from tests.conftest import PATIENCE_S, Cosim
 
 pytestmark = pytest.mark.engine
@@ -42,7 +43,7 @@ def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
     """Started before the run it says that it waits, then which episode came, and tells what that one tells."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
     words = ("listen", "events", "--connect", at, "--seconds", "0", "--wait", str(PATIENCE_S))
-    with started(*words) as listening, Session.hub(at) as hub:
+    with started(*words) as listening, listening_at(at) as hub:
         put_on_the_air(hub, "t-0")
         out, err = listening.communicate()
     assert listening.returncode == 0 and out == '{"tick":7}\n'
@@ -52,7 +53,7 @@ def test_listen_waits_until_an_episode_is_on_the_air(tmp_path: Path) -> None:
 def test_inject_waits_for_the_episode_that_is_named(tmp_path: Path) -> None:
     """Another episode of the same run does not do."""
     at = f"unixsock-stream/{tmp_path}/air.sock"
-    with Session.hub(at) as hub:
+    with listening_at(at) as hub:
         put_on_the_air(hub, "t-0")
         words = ("inject", PEDESTRIAN, "--connect", at, "--env", "r/t-1", "--wait", str(PATIENCE_S))
         with started(*words) as injecting:
@@ -72,7 +73,7 @@ def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(tmp_path: Path, 
     assert (
         waited.returncode == 3 and f"no run is on the air at {at}" in waited.stderr and "waited 0.1 s" in waited.stderr
     )
-    with Session.hub(at) as hub:
+    with listening_at(at) as hub:
         early = cosim("listen", "--connect", at)
         assert early.returncode == 3 and "none of its episodes" in early.stderr and "--wait 60 waits" in early.stderr
         put_on_the_air(hub, "t-0")

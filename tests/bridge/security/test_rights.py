@@ -16,6 +16,7 @@ from bridge.security.authority import issue, make_authority
 from bridge.session import open_session
 from cosim.core.errors import EngineError
 from cosim.spec.connection import Connection, Role
+from tests.bridge.ends import listening_at
 from tests.bridge.security.plain import free_port, plain_zenoh
 from tests.conftest import PATIENCE_S
 
@@ -28,7 +29,7 @@ SEEN = (f"{ENV}/status", f"{ENV}/log", f"{ENV}/camera", "cosim/r/status")
 ASKED = (*JOBS, *SEEN, "cosim/r/nets/0", f"{ENV}/inject", f"{ENV}/director", POLICY)
 OWN = b"asked by the one who tries"
 MAY_ASK: dict[str, tuple[str, ...]] = {
-    "worker": (*JOBS, "cosim/r/nets/0", f"{ENV}/director", POLICY),
+    "worker": (*JOBS, "cosim/r/status", "cosim/r/nets/0", f"{ENV}/director", POLICY),
     "viewer": SEEN,
     "injector": (f"{ENV}/inject", f"{ENV}/status"),
     "policy": (),
@@ -220,6 +221,20 @@ def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -
             assert set(replies(guests[role], key)) == {"FORGED"}, "its own answer, and nobody else's"
         assert asked == []
         assert session.ask(key, b"x", timeout_s=PATIENCE_S) == b"honest"
+
+
+@pytest.mark.parametrize("written", ["application/python-serialized-object", "application/x-unheard-of"])
+def test_what_would_have_to_be_unpickled_is_not_read(tmp_path: Path, written: str) -> None:
+    """A message that says it is a Python object, or something unheard of, is refused with what is read here."""
+    asked: list[bytes] = []
+    at = f"unixsock-stream/{tmp_path}/hub.sock"
+    with listening_at(at) as hub, plain_zenoh(at, None, "") as guest:
+        hub.serve("cosim/r/jobs/claim", lambda payload: asked.append(payload) or b"taken")  # type: ignore[func-returns-value]
+        got = [one.err.payload.to_string() for one in guest.get("cosim/r/jobs/claim", payload=b"x", encoding=written)]
+        assert got == [f"'{written}' is not read here: send application/msgpack or application/json"] and not asked
+        for fine in ("application/json", "application/msgpack", None):
+            (one,) = guest.get("cosim/r/jobs/claim", payload=b"x", encoding=fine)
+            assert one.ok.payload.to_bytes() == b"taken"
 
 
 def test_what_is_too_long_is_dropped_unread(certs: Path) -> None:
