@@ -2,8 +2,9 @@
 
 SUMO moves people and vehicles (libsumo) and builds the nets (netconvert, of eclipse-sumo), PyBullet moves the robot,
 the director's answers come over Zenoh; numpy, scipy and shapely, with the GEOS inside it, compute places, people and
-routes; sines and exponentials are those of the C library's libm. An imported OSM town is read by osmium. Pictures are
-drawn by moderngl in a context of glcontext, and filtered by OpenCV.
+routes; how sines and exponentials are rounded is up to the C library, to numpy and to the kind of processor, and is
+told as a hash of what they answer here. An imported OSM town is read by osmium. Pictures are drawn by moderngl in a
+context of glcontext, and filtered by OpenCV.
 
 Not here, because they only carry or show what was computed: msgspec, pandas, PyAV, rich, typer.
 """
@@ -13,6 +14,8 @@ from __future__ import annotations
 import platform
 from functools import lru_cache
 from importlib.metadata import PackageNotFoundError, version
+
+from cosim.core.arithmetic import arithmetic
 
 RECORDED_PACKAGES = (
     "sidewalk-cosim",
@@ -35,11 +38,12 @@ ENGINES = {"SUMO": "libsumo", "PyBullet": "pybullet", "Zenoh": "eclipse-zenoh", 
 
 @lru_cache(maxsize=1)
 def versions() -> dict[str, str]:
-    """Version of each package by distribution name, of `geos` as shapely loaded it, and of the C library `glibc`."""
+    """Version of each package by distribution name, of `geos` as shapely loaded it, and the `arithmetic` of
+    this machine (`cosim.core.arithmetic`). Machines of which all of it is the same simulate the same to the bit."""
     import shapely
 
     found = {package: version(package) for package in RECORDED_PACKAGES}
-    return {**found, "geos": shapely.geos_version_string, "glibc": platform.libc_ver()[1]}
+    return {**found, "geos": shapely.geos_version_string, "arithmetic": arithmetic()}
 
 
 def versions_in_words() -> str:

@@ -15,7 +15,7 @@ from cosim.core.geometry import Floats
 from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
 from cosim.records.paired import PairedDifference, difference_of_means, difference_of_rates
 from cosim.records.results import not_to_be_quoted, table_of
-from cosim.records.run_folder import RunSpec
+from cosim.records.run_spec import RunSpec
 from cosim.records.whole_run import WholeRun, read_whole_run
 from cosim.spec.scenario import Scenario
 

@@ -17,8 +17,9 @@ import os
 import shutil
 import sqlite3
 from collections.abc import Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
@@ -27,11 +28,9 @@ import pandas as pd
 
 from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
 from cosim.core.whole_file import write_whole
-from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
-from cosim.spec.goal import GoalProtocol
-from cosim.spec.odometry import OdometryKind
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Suite, write_suite
 
 DATABASE = "results.sqlite"
@@ -42,45 +41,6 @@ DAMAGE = {
 }  # fmt: skip
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
-SAME = (
-    "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
-    "versions", "renderer", "counterfactual", "waypoints", "seed",
-    "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time", "metric_schema",
-)  # fmt: skip
-"""What makes two runs the same."""
-
-
-class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
-    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
-    counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
-    that the policy is written in (`cosim.policies.load.source_hash`); waypoints: how those it answers are followed.
-    seed: see `cosim.spec.options.EpisodeOptions`. robots: which drive, and the hash of each. shared_renderer: whether
-    one process drew for all others when it began; what comes out is the same."""
-
-    suite: str
-    robots: dict[str, str]
-    suite_version: str
-    suite_hash: str
-    policy: str
-    policy_name: str
-    policy_version: str
-    policy_source: str = ""
-    waypoints: WaypointRule = WaypointRule()
-    camera: CameraSpec | None = None
-    cameras: dict[str, CameraSpec] = {}
-    rate_hz: float = 4.0
-    goal_protocol: GoalProtocol = "none"
-    odometry: OdometryKind = "none"
-    latency_ms: float = 0.0
-    real_time: bool = False
-    seed: int = 0
-    scenarios: tuple[str, ...]
-    versions: dict[str, str]
-    renderer: str = "unknown"
-    counterfactual: bool = False
-    shared_renderer: bool = False
-    metric_schema: int = 0
-    schema: int = 1
 
 
 class RunFolder:
@@ -112,16 +72,11 @@ class RunFolder:
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since it began. Resume "
                 "with the source as it was, or choose another --out."
             )
-        for field in SAME:
-            mine, theirs = getattr(spec, field), getattr(found, field)
-            if mine != theirs:
-                if isinstance(mine, dict) and isinstance(theirs, dict):
-                    changed = {name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name)}
-                    mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
-                raise RunError(
-                    f"{path} is of another run: its {field} is {_brief(theirs)}, now asked for is {_brief(mine)}. "
-                    "Resume with the same command, or choose another --out."
-                )
+        if (apart := found.apart(spec)) is not None:
+            raise RunError(
+                f"{path} is of another run: its {apart.field} is {apart.mine}, now asked for is {apart.theirs}. "
+                f"Resume with the same command, or choose another --out.{apart.hint}"
+            )
         return cls(path, found)
 
     def __enter__(self) -> Self:
@@ -275,20 +230,26 @@ def read_spec(path: Path) -> RunSpec:
         raise RunError(f"{path / 'run.json'}: cannot be read: {why}: name another run, or run it again") from error
 
 
-def read_records(path: Path) -> list[Record]:
-    """The records of a run folder, finished or not, in the order in which they ended."""
+def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
+    """The records of a run folder, finished or not, in the order in which they ended. untouched: no byte of the folder
+    changes, also where a run was killed: a copy of its database is read."""
     read_spec(path)
     if not (path / DATABASE).exists():
         if any(path.glob("episodes/*/record.json")):
             raise RunError(f"{path / DATABASE} is gone: {REMEDY}")
         return []
     try:
-        with closing(_connect(path)) as database:
-            return _records(database)
+        with ExitStack() as stack:
+            where = Path(stack.enter_context(TemporaryDirectory())) if untouched else path
+            for file in path.glob(f"{DATABASE}*") if untouched else ():
+                shutil.copyfile(file, where / file.name)
+            return _records(stack.enter_context(closing(_connect(where))))
     except msgspec.DecodeError as error:
         raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
     except sqlite3.Error as error:
         raise _trouble(path, error) from error
+    except OSError as error:
+        raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 
 
 def read_rows(path: Path) -> dict[str, dict[str, Any]]:
@@ -387,8 +348,3 @@ def _trouble(path: Path, error: sqlite3.Error) -> RunError | MachineError:
     if _is_damage(error):
         return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
     return MachineError(f"{path / DATABASE}: {error}. Finished episodes are safe: make room and add --resume.")
-
-
-def _brief(value: object) -> str:
-    text = str(getattr(value, "in_words", value))
-    return text if len(text) <= 80 else text[:77] + "..."

@@ -10,7 +10,8 @@ import msgspec
 
 from cosim.core.errors import RunError
 from cosim.records.record import METRIC_SCHEMA, Record
-from cosim.records.run_folder import DATABASE, RunSpec, read_records, read_spec, refuse_in_use
+from cosim.records.run_folder import DATABASE, read_records, read_spec, refuse_in_use
+from cosim.records.run_spec import RunSpec
 from cosim.spec.ranges import shown
 from cosim.spec.scenario import Scenario, content_hash, read_suite
 
@@ -39,6 +40,12 @@ def read_whole_run(path: Path) -> WholeRun:
     if not records:
         raise RunError(f"{path}: no episode of it has ended: give the command of the run again with --resume")
     scenarios = {scenario.id: scenario for scenario in read_suite(path / "scenarios.json").scenarios}
+    check_records(path, records, scenarios)
+    return WholeRun(path, spec, scenarios, records)
+
+
+def check_records(path: Path, records: Mapping[str, Record], scenarios: Mapping[str, Scenario]) -> None:
+    """Hold records of `results.sqlite` against the files of a run folder. Raises RunError as `read_whole_run` does."""
     for name, record in records.items():
         _check_schema(path, record)
         if name not in scenarios or content_hash(scenarios[name]) != record.scenario_hash:
@@ -47,7 +54,6 @@ def read_whole_run(path: Path) -> WholeRun:
                 "the file back as it was, or run it again into another --out"
             )
         check_record_file(path, record)
-    return WholeRun(path, spec, scenarios, records)
 
 
 def check_record_file(path: Path, record: Record) -> None:
@@ -57,7 +63,7 @@ def check_record_file(path: Path, record: Record) -> None:
     if not file.exists():
         if record.ended is not None:
             raise RunError(f"{file}: not there: {anew(file)}")
-    elif apart := _apart(_read(file), record):
+    elif apart := told_apart(read_record(file), record):
         raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
 
 
@@ -74,14 +80,15 @@ def anew(file: Path) -> str:
     )
 
 
-def _read(file: Path) -> Record:
+def read_record(file: Path) -> Record:
+    """The record in a file of a run folder. Raises RunError, with what mends it."""
     try:
         return Record.load(file)
     except RunError as error:
         raise RunError(f"{error}: {anew(file)}") from error
 
 
-def _apart(mine: Record, theirs: Record) -> str:
+def told_apart(mine: Record, theirs: Record) -> str:
     """Where two records of an episode are first apart, in words; "" where they are not."""
     told, other = (msgspec.to_builtins(record) for record in (mine, theirs))
     for field, value in told.items():

@@ -19,7 +19,8 @@ from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
 from cosim.policies.load import load_policy
 from cosim.records.record import METRIC_SCHEMA, NO_RENDERER
-from cosim.records.run_folder import RunFolder, RunSpec, read_spec
+from cosim.records.run_folder import RunFolder, read_spec
+from cosim.records.run_spec import RunSpec, Shard
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.pseudonym import drawn_seed
 from cosim.spec.robot import robot_called
@@ -105,9 +106,11 @@ def run(
 
 
 def run_spec(
-    whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions, shared: bool = False
-) -> RunSpec:
-    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it. Raises UsageError when
+    whole: Suite, picked: Sequence[Scenario], policy: str, driver: Driver, options: EpisodeOptions,
+    shared: bool = False, shard: Shard | None = None,
+) -> RunSpec:  # fmt: skip
+    """What a run is, for its folder. policy: its name; shared: one renderer draws for all of it; shard: what of
+    it the folder holds, if not all. Raises UsageError when
     a robot has no such camera, unless one of its own was asked for, or the policy cannot be given what it asks for."""
     manifest = with_goal(driver.manifest, options.goal)
     robots = [robot_called(name) for name in sorted({one.robot for one in picked})]
@@ -138,6 +141,7 @@ def run_spec(
         renderer=renderer_of(chosen_camera(options.camera)) if manifest.camera is not None else NO_RENDERER,
         counterfactual=options.counterfactual,
         shared_renderer=shared,
+        shard=shard,
     )
 
 

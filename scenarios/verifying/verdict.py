@@ -74,7 +74,7 @@ def findings(shipped: Given, here: Given) -> Iterator[Finding]:
 
 def _packages(shipped: Given, here: Given) -> Iterator[Finding]:
     others = {n: (here.versions.get(n, "none"), v) for n, v in shipped.versions.items() if here.versions.get(n) != v}
-    others.pop("glibc", None)
+    others.pop("arithmetic", None)
     for name, (mine, told) in others.items():
         yield Finding(f"package {name}", False, f"{mine} here, {told} as shipped: {_REINSTALL}")
     if not others:
@@ -148,7 +148,7 @@ def _blame(of: Blame, shipped: Given, here: Given) -> str:
     others = [
         f"{name} {here.versions.get(name, 'none')} here, {told} as shipped"
         for name, told in shipped.versions.items()
-        if name in (*of.packages, "glibc", "geos") and here.versions.get(name) != told
+        if name in (*of.packages, "arithmetic", "geos") and here.versions.get(name) != told
     ]
     edited = [room for room in of.rooms if here.sources.get(room) != shipped.sources.get(room)]
     alike = shipped.alone.get(of.engine) == here.alone.get(of.engine)

@@ -12,7 +12,8 @@ import moderngl
 import pytest
 
 from cosim.core.errors import EngineError, RunError
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Suite
 from physics.cameras import choice as cameras
 from physics.cameras.gl import context

@@ -16,7 +16,8 @@ from cosim.episode.ports import Manifest
 from cosim.judge.metrics import EpisodeFacts, every_metric
 from cosim.judge.referee import Failure
 from cosim.records.record import METRIC_SCHEMA, Record, begun
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import City, Scenario, Suite
 
 SPEED_MPS = 1.0

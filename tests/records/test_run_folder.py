@@ -20,7 +20,8 @@ from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.judge.metrics import METRICS
 from cosim.records.record import Record
 from cosim.records.results import summary_of, table_of, table_row
-from cosim.records.run_folder import RunFolder, RunSpec, read_records, read_spec
+from cosim.records.run_folder import RunFolder, read_records, read_spec
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
 

@@ -16,7 +16,8 @@ from cosim.place.street_map import Port
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.records.record import Record
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec.events import EventReply
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, CrowdSpec, Scenario, Suite, write_suite

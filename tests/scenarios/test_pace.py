@@ -10,7 +10,8 @@ import pytest
 from cosim.core.telling import duration
 from cosim.core.versions import versions
 from cosim.records.record import Record
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Scenario, Suite
 from scenarios.catalog import load_suite
 from scenarios.execution import pace

@@ -17,7 +17,8 @@ from cosim.core.errors import MachineError
 from cosim.episode.driver import PolicyCall
 from cosim.policies.load import load_policy
 from cosim.records.record import Record, begun
-from cosim.records.run_folder import RunFolder, RunSpec, read_records
+from cosim.records.run_folder import RunFolder, read_records
+from cosim.records.run_spec import RunSpec
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.execution import pool

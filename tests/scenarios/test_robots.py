@@ -29,7 +29,8 @@ from cosim.policies.groups import lines
 from cosim.policies.orca import Here, lane_past
 from cosim.policies.route import best_lane, crossing_limit
 from cosim.policies.social_force import bodies_m
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec import robot as table
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import COURIER, ROBOTS, SCOUT, Mount, Robot, Skid

@@ -4,3 +4,4 @@ from __future__ import annotations
 
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
 TRUST = "Trust what came out"
+MANY = "Many machines"

@@ -39,6 +39,7 @@ _SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
 _OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
+_SHARD_HELP = "Run only every N-th scenario, from the I-th on; needs --seed. `cosim merge` makes one run of all N."
 _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 
 
@@ -52,6 +53,7 @@ _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`)
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
+    "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
@@ -69,6 +71,7 @@ def run_command(
     split: Annotated[str | None, typer.Option(help="Run only scenarios of val, or of test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     shared_renderer: Annotated[bool, typer.Option("--shared-renderer", help=_SHARED_HELP)] = False,
+    shard: Annotated[str, typer.Option(metavar="I/N", help=_SHARD_HELP)] = "",
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,
     map_name: Annotated[
@@ -117,6 +120,7 @@ def run_command(
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
     from cosim.policies.load import load_policy
     from cosim.records.run_folder import RunFolder
+    from cosim.records.run_spec import Shard
     from cosim.spec.goal import goal_called
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
@@ -154,7 +158,13 @@ def run_command(
     )  # fmt: skip
     if split not in (None, *get_args(Split)):
         raise unknown("split", str(split), get_args(Split))
-    picked = scenarios_chosen(whole, scenario or (), episodes, event or (), split)
+    of_run = scenarios_chosen(whole, scenario or (), episodes, event or (), split)
+    part = Shard.called(shard, len(of_run)) if shard else None
+    if part is not None and seed is None and not resume:
+        raise UsageError("--shard needs --seed: shards are of one run, which has one seed: give the same to each")
+    if part is not None and latency == "measured":
+        raise UsageError("--shard with --latency measured: each would measure another: give milliseconds")
+    picked = of_run if part is None else part.share(of_run)
     loaded = load_policy(policy)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
@@ -164,7 +174,8 @@ def run_command(
         raise UsageError("--resume needs --out: the folder of the run to finish")
     run_seed = seed_of_run(seed, folder if resume else None)
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}"
+    suffix = "" if part is None else f"-{part.number}-of-{part.of}"
+    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}{suffix}"
     with doing(LOOKING) as tell:
         check_places(whole, picked, tell)
     named = keys.chunk(path.name)
@@ -185,7 +196,7 @@ def run_command(
     went_on = folder if resume else None
     options = with_latency(options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz)
     check_alone(options, jobs, shared_renderer)
-    spec = run_spec(whole, picked, policy, loaded, options, shared_renderer)
+    spec = run_spec(whole, of_run, policy, loaded, options, shared_renderer, part)
     with ExitStack() as stack:
         if on_air is not None:
             hub = stack.enter_context(open_session(on_air.connection))
@@ -232,9 +243,11 @@ def run_command(
             err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
             raise typer.Exit(INTERRUPTED) from None
         table = held.finish()
-    print_table(out, table, len(picked))
+    print_table(out, table, len(of_run))
     print_by_kind(out, table, kinds_of(path))
     out.print(f"Run folder: {path}", soft_wrap=True)
+    if part is not None:
+        err.print(f"Shard {part.in_words} of the run: `cosim merge` makes one of all.", highlight=False)
     if lacking := [s.id for s in picked if s.id not in set(table["scenario"])]:
         err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
     if lacking or table["ended"].isna().any():

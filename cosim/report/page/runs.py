@@ -18,7 +18,7 @@ from cosim.core.telling import Tell, untold
 from cosim.episode.log import Log
 from cosim.records.record import Record
 from cosim.records.results import table_of
-from cosim.records.run_folder import RunSpec
+from cosim.records.run_spec import RunSpec
 from cosim.records.whole_run import WholeRun, anew, read_whole_run, record_file
 from cosim.spec.scenario import CityMap, Light, Scenario
 

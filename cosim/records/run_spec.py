@@ -1,0 +1,114 @@
+"""RunSpec: what a run is; and Shard, the part of one that a folder holds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple, TypeVar
+
+import msgspec
+
+from cosim.core.errors import UsageError
+from cosim.episode.ports import CameraSpec, WaypointRule
+from cosim.spec.goal import GoalProtocol
+from cosim.spec.odometry import OdometryKind
+
+_T = TypeVar("_T")
+SAME = (
+    "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
+    "versions", "renderer", "counterfactual", "waypoints", "seed",
+    "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time", "metric_schema", "shard",
+)  # fmt: skip
+"""What makes two runs the same."""
+_ARITHMETIC = (
+    " Of two machines whose arithmetic is apart the processors or C libraries round differently: episodes of one are "
+    "not those of the other to the bit."
+)
+
+
+class Shard(msgspec.Struct, frozen=True):
+    """Every `of`-th scenario of a run, beginning with the `number`-th, which counts from 1."""
+
+    number: int
+    of: int
+
+    @classmethod
+    def called(cls, words: str, scenarios: int) -> Shard:
+        """The one that "2/8" names, of a run of so many scenarios. Raises UsageError."""
+        found = re.fullmatch(r"([1-9][0-9]{0,5})/([1-9][0-9]{0,5})", words, re.ASCII)
+        number, of = (int(part) for part in found.groups()) if found else (0, 0)
+        if not 0 < number <= of:
+            raise UsageError(f"--shard {words}: give i/n, with i from 1 to n, such as 1/4, 2/4, 3/4 and 4/4")
+        if of > scenarios:
+            raise UsageError(f"--shard {words}: the run has {scenarios} scenarios, and more shards than that are empty")
+        return cls(number, of)
+
+    @property
+    def in_words(self) -> str:
+        return f"{self.number}/{self.of}"
+
+    def share(self, whole: Sequence[_T]) -> list[_T]:
+        """What of the whole run is this shard's."""
+        return list(whole[self.number - 1 :: self.of])
+
+
+class Apart(NamedTuple):
+    """A field in which two runs are not the same, with both values in words, and what else is to be said of it."""
+
+    field: str
+    mine: str
+    theirs: str
+    hint: str
+
+
+class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
+    """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
+    counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
+    that the policy is written in (`cosim.policies.load.source_hash`); waypoints: how those it answers are followed.
+    seed: see `cosim.spec.options.EpisodeOptions`. robots: which drive, and the hash of each. shared_renderer: whether
+    one process drew for all others when it began; what comes out is the same. scenarios: of the whole run; shard: which
+    part of them the folder holds, where it is not all."""
+
+    suite: str
+    robots: dict[str, str]
+    suite_version: str
+    suite_hash: str
+    policy: str
+    policy_name: str
+    policy_version: str
+    policy_source: str = ""
+    waypoints: WaypointRule = WaypointRule()
+    camera: CameraSpec | None = None
+    cameras: dict[str, CameraSpec] = {}
+    rate_hz: float = 4.0
+    goal_protocol: GoalProtocol = "none"
+    odometry: OdometryKind = "none"
+    latency_ms: float = 0.0
+    real_time: bool = False
+    seed: int = 0
+    scenarios: tuple[str, ...]
+    versions: dict[str, str]
+    renderer: str = "unknown"
+    counterfactual: bool = False
+    shared_renderer: bool = False
+    metric_schema: int = 0
+    shard: Shard | None = None
+    schema: int = 1
+
+    def apart(self, other: RunSpec, but: str = "") -> Apart | None:
+        """The first field in which another run is not the same; None where it is. but: a field that may differ."""
+        for field in SAME:
+            mine, theirs = getattr(self, field), getattr(other, field)
+            if mine == theirs or field == but:
+                continue
+            changed: set[str] = set()
+            if isinstance(mine, dict) and isinstance(theirs, dict):
+                changed = {name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name)}
+                mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
+            return Apart(field, _brief(mine), _brief(theirs), _ARITHMETIC if "arithmetic" in changed else "")
+        return None
+
+
+def _brief(value: object) -> str:
+    text = str(getattr(value, "in_words", value))
+    return text if len(text) <= 80 else text[:77] + "..."
