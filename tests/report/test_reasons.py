@@ -101,6 +101,13 @@ def test_things_lanes_and_standing_still_have_words_too() -> None:
     assert log is not None
     thing = Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, "obstacle:0:bike", "object")
     assert told(thing) == "drove into a parked bike at 1.0 m/s"
+    named = {
+        "barrier::n13x9_c1:0": "a barrier",
+        "prop:s612:3": "a piece of street furniture",
+        "building:s380:1": "a wall",
+    }
+    for name, words in (named | {"obstacle:2:bin": "a bin"}).items():
+        assert told(Failure("collision", 79, 4.0, 0.0, 4.0, 1.0, name, "object")) == f"drove into {words} at 1.0 m/s"
     off = Failure("out_of_lane", 79, 4.0, 1.5, 4.0, 1.0)
     assert told(off) == "left the sidewalk on its left side at 1.0 m/s, 1.5 m off the route"
     assert told(failure_at(log, 79, "freezing")) == "stayed within 0.5 m for 10 s, the nearest person 1.5 m away"

@@ -25,9 +25,10 @@ CAUSES: Final = (
     "person", "vehicle", "obstacle", "off the sidewalk", "froze", "out of time", "broke the rule", "policy crashed",
 )  # fmt: skip
 """Kinds of reasons, in the order in which they are shown."""
-_FURNITURE: Final = {
+_THINGS: Final = {
     "sign": "sandwich board", "cafe": "cafe table", "bike": "parked bike", "box": "pile of parcels",
-    "fence": "construction fence", "scooter": "parked scooter",
+    "fence": "construction fence", "scooter": "parked scooter", "barrier": "barrier", "building": "wall",
+    "prop": "piece of street furniture",
 }  # fmt: skip
 
 
@@ -100,8 +101,9 @@ def reason_of(scenario: Scenario, record: Record, mishap: Mishap, log: Log | Non
 
 def thing_in_words(failure: Failure) -> str:
     """What was touched that is neither person nor vehicle: "a parked bike"."""
-    kind = failure.other.rsplit(":", 1)[-1] if ":" in failure.other else failure.other_kind
-    words = _FURNITURE.get(kind, kind.replace("_", " ") or "something")
+    of, _, which = failure.other.partition(":")
+    kind = which.rpartition(":")[2] if of == "obstacle" else of
+    words = _THINGS.get(kind, kind if of == "obstacle" else failure.other_kind).replace("_", " ") or "something"
     return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
 
 
