@@ -50,10 +50,13 @@ def _encoded(ack: Ack, *, as_json: bool) -> bytes:
 def send_injection(session: Session, key: str, injection: bytes, timeout_s: float = 5.0) -> Ack:
     """Send an injection (JSON) and wait for its acknowledgement.
 
-    Raises EngineError when the other side answers something else, TimeoutError when nobody answers.
+    Raises SpecError for one that is too long, EngineError when nobody answers, or something else.
     """
-    reply = session.ask(key, injection, timeout_s=timeout_s)
+    if len(injection) > LARGEST_B:
+        raise SpecError(f"{len(injection)} bytes: an injection has at most {LARGEST_B}")
     try:
-        return msgspec.json.decode(reply, type=Ack)
+        return msgspec.json.decode(session.ask(key, injection, timeout_s=timeout_s), type=Ack)
+    except TimeoutError as error:
+        raise EngineError(f"{error}: the episode has ended, or is too busy; what it did is in its log") from error
     except msgspec.DecodeError as error:
         raise EngineError(f"'{key}' answered something that is no acknowledgement: {error}") from error

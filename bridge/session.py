@@ -213,8 +213,9 @@ class LoneSession(Session):
 def open_session(connection: Connection, say: Callable[[str], None] = lambda _: None) -> Session:
     """Open one end of a session: a hub where it listens, else a client of the hub that it connects to.
 
-    say: told in one line what is insecure, and which certificate ends soon. Raises AccessError for certificates that do
-    not fit, here or there (trying again changes nothing), and EngineError when an endpoint is taken or nobody answers.
+    say: told, once it is open, in a line each what is insecure and which certificate ends soon. Raises AccessError for
+    certificates that do not fit, here or there (trying again changes nothing), EngineError when an endpoint is taken or
+    nobody answers.
 
     >>> from cosim.spec.connection import Connection
     >>> with open_session(Connection(role="coordinator", listen="tcp/127.0.0.1:7461")) as hub:
@@ -223,12 +224,14 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
     ...         one.ask("cosim/r/status", b"well?", timeout_s=60.0)
     b'WELL?'
     """
-    for line in notices_of(connection):
-        say(line)
+    notices = notices_of(connection)
     more: dict[str, object] = {"transport/link/tls": _tls(Path(connection.tls))} if connection.tls else {}
     if connection.listen:
         more |= access_of(connection)
-    return _listening(connection, more) if connection.listen else _connected(connection, more)
+    session = _listening(connection, more) if connection.listen else _connected(connection, more)
+    for line in notices:
+        say(line)
+    return session
 
 
 def notices_of(connection: Connection) -> list[str]:

@@ -77,5 +77,8 @@ def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(tmp_path: Path, 
         early = cosim("listen", "--connect", at)
         assert early.returncode == 3 and "none of its episodes" in early.stderr and "--wait 60 waits" in early.stderr
         put_on_the_air(hub, "t-0")
+        (tmp_path / "long.json").write_text(json.dumps({"id": "anna", "path": [[1, 2]] * 20_000}))
+        too_long = cosim("inject", f"@{tmp_path}/long.json", "--connect", at)
+        assert too_long.returncode == 2 and "an injection has at most 65536" in too_long.stderr
         other = cosim("listen", "--connect", at, "--env", "r/t-9", "--wait", "0.1")
         assert other.returncode == 2 and "unknown running episode 'r/t-9'. Valid choices: r/t-0." in other.stderr

@@ -80,7 +80,10 @@ def listen(
     session, below = _found(connecting("viewer", "--connect", connect, tls, insecure), env, wait)
     with session:
         if topic == "events":
-            print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
+            try:
+                print(session.ask(f"{below}/log", b"", timeout_s=5.0).decode(), flush=True)
+            except TimeoutError as error:
+                raise EngineError(f"{error}: the episode has ended, or is too busy") from error
         heard: SimpleQueue[bytes] = SimpleQueue()
         session.listen(f"{below}/{topic}", lambda _, payload: heard.put(payload))
         ends_at = time.monotonic() + (seconds if seconds is not None else 1e9)

@@ -6,6 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from bridge.session import open_session
+from cosim.spec.connection import Connection
+from tests.bridge.security.plain import free_port
 from tests.conftest import Cosim
 
 DOORS = {
@@ -33,12 +36,19 @@ def test_no_door_is_open_to_others_in_silence(door: str, cosim: Cosim, tmp_path:
         assert refused.returncode == 2 and said in refused.stderr, refused.stderr
 
 
+@pytest.mark.engine
 def test_insecure_says_in_one_line_what_it_means(cosim: Cosim) -> None:
-    """On standard error, before anybody is waited for."""
-    tried = cosim("listen", "--connect", "tcp/localhost.:1", "--insecure")
+    """On standard error, of who listens and of who connects."""
+    port, said = free_port(), list[str]()
+    open_to_all = Connection(role="coordinator", listen=f"tcp/0.0.0.0:{port}", insecure=True)
+    with open_session(open_to_all, said.append):
+        (line,) = said
+        assert line.startswith(f"--insecure: whoever can reach tcp/0.0.0.0:{port} may watch, inject pedestrians, take")
+        at = f"tcp/127.1:{port}"
+        tried = cosim("listen", "--connect", at, "--insecure")
     (line,) = [line for line in tried.stderr.splitlines() if line.startswith("--insecure: ")]
-    assert "whoever stands between here and tcp/localhost.:1 may read and change all that is sent" in line
-    assert tried.returncode == 3 and "no run is on the air" in tried.stderr
+    assert f"whoever stands between here and {at} may read and change all that is sent" in line
+    assert tried.returncode == 3 and "none of its episodes is on the air" in tried.stderr
 
 
 def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None:
