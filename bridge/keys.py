@@ -31,6 +31,29 @@ def director(run: str, env: str) -> str:
     return f"cosim/{name(run)}/env/{name(env)}/director"
 
 
+def job(run: str, act: str) -> str:
+    """Where workers of a run do this with its jobs: claim, renew, result, failed."""
+    return f"cosim/{name(run)}/jobs/{name(act)}"
+
+
+def worker(run: str, worker: str) -> str:
+    """Where a worker of a run is seen to be there; "*" for any."""
+    return f"cosim/{name(run)}/workers/{worker if worker == '*' else name(worker)}"
+
+
+def status(run: str) -> str:
+    """Where a run's coordinator tells how it goes."""
+    return f"cosim/{name(run)}/status"
+
+
+def net(run: str, digest: str) -> str:
+    """Where a run's coordinator hands out a street net, by its hash; "*" for any."""
+    return f"cosim/{name(run)}/nets/{digest if digest == '*' else name(digest)}"
+
+
+EVERY_RUN = "cosim/*/status"
+"""Asked, the coordinator of a run answers."""
+
 EVERY_DIRECTOR = "cosim/*/env/*/director"
 """What a director of any run answers."""
 

@@ -56,6 +56,29 @@ def _config(mode: str, listen: Sequence[str], connect: Sequence[str], more: Mapp
     return config
 
 
+class Query:
+    """A query that waits for its reply, from any thread. key: what was asked; payload: what came with it."""
+
+    def __init__(self, query: zenoh.Query) -> None:
+        self.key = str(query.key_expr)
+        self.payload = bytes(query.payload.to_bytes()) if query.payload is not None else b""
+        self._query: zenoh.Query | None = query
+
+    def answer(self, payload: bytes) -> None:
+        """Reply, once; to who is gone already nothing happens."""
+        query, self._query = self._query, None
+        if query is not None:
+            with suppress(zenoh.ZError), query:
+                query.reply(self.key, payload)
+
+    def refuse(self, words: str) -> None:
+        """Reply with an error."""
+        query, self._query = self._query, None
+        if query is not None:
+            with suppress(zenoh.ZError), query:
+                query.reply_err(words.encode())
+
+
 class Session:
     """An open Zenoh session. Use as a context manager: a session left open keeps the process alive.
 
@@ -67,6 +90,7 @@ class Session:
         self._session, self._inside, self._folder = session, inside, folder
         self._queryables: list[zenoh.Queryable[None]] = []
         self._subscribers: list[zenoh.Subscriber[Any]] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
 
     @property
     def inside(self) -> Connection:
@@ -93,6 +117,51 @@ class Session:
                     query.reply_err(f"{type(error).__name__}: {error}".encode())
 
         self._queryables.append(self._session.declare_queryable(key, answer, complete=True))
+
+    def collect(self, key: str, take: Callable[[Query], None], *, found: bool = False) -> None:
+        """Hand queries on `key` over to `take`, in a thread of Zenoh's, where nothing may wait: they are answered
+        later, elsewhere. found: see `serve`; such a query is to be answered on `key`."""
+
+        def handed(query: zenoh.Query) -> None:
+            asked = Query(query)
+            if "*" in asked.key:
+                if not found:
+                    asked.refuse(f"ask for exactly '{key}', not '{asked.key}'")
+                    return
+                asked.key = key
+            take(asked)
+
+        self._queryables.append(self._session.declare_queryable(key, handed, complete=True))
+
+    def send(self, key: str, payload: bytes, replied: Callable[[bytes | None, str], None], *, timeout_s: float) -> None:
+        """Ask once, without waiting. `replied` is called once, in a thread of Zenoh's, where nothing may wait: with the
+        reply; or with None, and the other side's error, "" where nobody answered in time."""
+        found: list[bytes] = []
+        errors: list[str] = []
+
+        def heard(reply: zenoh.Reply) -> None:
+            if reply.ok is not None:
+                found.append(bytes(reply.ok.payload.to_bytes()))
+            elif reply.err is not None and (words := reply.err.payload.to_string()) != "Timeout":
+                errors.append(words)
+
+        def over() -> None:
+            replied(found[0] if found else None, errors[0] if errors else "")
+
+        hears = zenoh.handlers.Callback(heard, over, indirect=False)
+        self._session.get(key, hears, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE)
+
+    def stand(self, key: str) -> None:
+        """Be seen at `key` by those who `watch` it, as long as this session is there."""
+        self._tokens.append(self._session.liveliness().declare_token(key))
+
+    def watch(self, key: str, heard: Callable[[str, bool], None]) -> None:
+        """Call `heard(key, there)` for everybody who `stand`s at a key expression now or later, and when they go."""
+
+        def told(sample: zenoh.Sample) -> None:
+            heard(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
+
+        self._subscribers.append(self._session.liveliness().declare_subscriber(key, told, history=True))
 
     def answers(self, key: str, *, timeout_s: float) -> dict[str, bytes]:
         """Everybody's replies to one empty query on a key expression, by their keys; errors are left out."""
@@ -142,6 +211,9 @@ class Session:
             for subscriber in self._subscribers:
                 subscriber.undeclare()  # type: ignore[no-untyped-call]
             self._subscribers.clear()
+            for token in self._tokens:
+                token.undeclare()  # type: ignore[no-untyped-call]
+            self._tokens.clear()
             self._session.close()  # type: ignore[no-untyped-call]
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)

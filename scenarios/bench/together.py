@@ -66,9 +66,9 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
         logs = held.path / "logs"
         renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True)) if shared else None
         with suppress(_Enough):
-            processes = LocalProcesses(logs)
+            processes = LocalProcesses(logs, environments)
             run_all(
-                held, picked, hello, processes, jobs=environments, tell=watch.hear, options=options, renderer=renderer
+                held, picked, hello, processes, tell=watch.hear, options=options, renderer=renderer
             )
     how = "shared renderer and batched policy" if shared else "each with its own renderer and policy"
     rate, reach = watch.rate(), 60.0 if shared and environments == ENVIRONMENTS else None

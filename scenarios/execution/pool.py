@@ -1,9 +1,10 @@
-"""Runs scenarios by N workers, which a transport reaches.
+"""Runs scenarios by the workers that a transport reaches.
 
 A worker that dies (SUMO and PyBullet can take its process down) is replaced and its scenario tried once more; an engine
 that shows no sign of life is killed. After the last attempt the episode is recorded, so that none is ever lost: as
 invalid if it was an engine that failed, as crashed if that may have been the policy, which gets nothing out of ending
-its process. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in
+its process. A worker that is lost together with its machine is no attempt: its scenario goes to another one, and what the
+first one still delivers is taken if it comes first. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in
 time is not asked again: its episode has crashed. What comes out of an episode is written here, by the run's own
 process.
 """
@@ -11,7 +12,7 @@ process.
 from __future__ import annotations
 
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
@@ -27,10 +28,12 @@ from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
 from scenarios.execution.asked import Patience, Question
 from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Ready, Unable
-from scenarios.execution.transport import Transport, Worker
+from scenarios.execution.transport import Late, Reception, Transport, Worker
 from scenarios.rendering.shared import SharedRenderer
 
 ATTEMPTS = 2
+LOSSES = 8
+"""So many workers may be lost, each with all that is beside it, while they run one scenario."""
 SILENCE_S = 300.0
 """A worker that says nothing for so long, while its policy has nothing to answer, hangs in an engine."""
 
@@ -43,14 +46,14 @@ def run_all(
     hello: Hello,
     transport: Transport,
     *,
-    jobs: int,
     tell: Hear,
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     patience: Patience = Patience(),  # noqa: B008  a frozen value
     renderer: SharedRenderer | None = None,
 ) -> None:
-    """Run scenarios, `jobs` at a time, adding each record to the folder as it ends: in the order of what they are
-    called before the policy, so that one that counts its episodes does not learn which they are.
+    """Run scenarios, as many at a time as the transport has room for, adding each record to the folder as it ends: in
+    the order of what they are called before the policy, so that one that counts its episodes does not learn which they
+    are.
 
     hello: the policy as it was loaded here. renderer: what draws for all of them; the caller ends it. Raises UsageError
     when a worker cannot load the policy, MachineError when none can be started or a record cannot be written."""
@@ -60,29 +63,37 @@ def run_all(
     options = msgspec.structs.replace(options, seed=folder.spec.seed)
     pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
     waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
-    attempts = dict.fromkeys((s.id for s in scenarios), 0)
+    attempts: Counter[tuple[str, bool]] = Counter()
     try:
         while waiting or pool.busy:
-            while waiting and len(pool.busy) < jobs:
+            while waiting and transport.room(len(pool.busy)) > 0:
                 pool.give(waiting.popleft())
             for lost in pool.listen():
-                attempts[lost.scenario.id] += bool(lost.why)
-                if attempts[lost.scenario.id] < ATTEMPTS:
+                so_far, most = (lost.scenario.id, lost.away), LOSSES if lost.away else ATTEMPTS
+                attempts[so_far] += bool(lost.why)
+                if attempts[so_far] < most:
                     waiting.appendleft(lost.scenario)
                 else:
-                    why = f"{lost.why}, {ATTEMPTS} times; see logs/ in the run folder"
+                    why = f"{lost.why}, {most} times; see logs/ in the run folder"
                     pool.give_up(lost.scenario, why, "invalid" if lost.in_engine else "crashed")
+            pool.take_unasked(waiting)
     finally:
         pool.close()
 
 
+def _called(name: str, waiting: deque[Scenario]) -> Scenario | None:
+    """The scenario of that name, if it waits."""
+    return next((scenario for scenario in waiting if scenario.id == name), None)
+
+
 class _Lost(NamedTuple):
     """A scenario that is not done, whose worker or whose engine failed. why: "" if it never began; in_engine: whether
-    it was an engine for sure."""
+    it was an engine for sure; away: see `Worker`."""
 
     scenario: Scenario
     why: str
     in_engine: bool = False
+    away: bool = False
 
 
 class _Slot:
@@ -121,6 +132,51 @@ class _Pool:
     def busy(self) -> list[_Slot]:
         return [w for w in self._workers if w.job is not None]
 
+    def take_unasked(self, waiting: deque[Scenario]) -> None:
+        """Take in workers that go on with what waits, and results that come late; what they are of waits no more."""
+        for one in self._transport.unasked():
+            if isinstance(one, Late):
+                one.answer(self._late(one.done, waiting))
+            elif (scenario := _called(one.scenario, waiting)) is None:
+                one.worker.kill()
+            else:
+                waiting.remove(scenario)
+                slot = _Slot(one.worker)
+                slot.job = scenario
+                self._workers.append(slot)
+
+    def _late(self, done: Done, waiting: deque[Scenario]) -> Reception:
+        """A result from a worker that its job had been taken from is kept if there is none. Who has that job now is
+        freed."""
+        busy = next((slot for slot in self.busy if slot.job is not None and slot.job.id == done.scenario), None)
+        scenario = _called(done.scenario, waiting) if busy is None else busy.job
+        if scenario is None:
+            return self._second(done)
+        record = self._record_of(scenario, done)
+        if record is None or done.again or self._options.frames_every_s:  # of its frames some may have come nowhere
+            return "refused"
+        if busy is None:
+            waiting.remove(scenario)
+        else:
+            busy.worker.kill()
+            self._workers.remove(busy)
+        self._folder.keep(record, done.log)
+        self._over(scenario, record.status)
+        return "kept"
+
+    def _second(self, done: Done) -> Reception:
+        """A result of a scenario that has one. Two episodes that came to their end must be alike."""
+        if done.scenario not in self._folder.spec.scenarios:
+            return "refused"
+        try:
+            kept = Record.load(self._folder.episode_folder(done.scenario) / "record.json")
+            came = Record.decoded(done.record, self._folder.path)
+        except RunError:
+            return "refused"
+        alike = msgspec.structs.replace(kept, clock={}) == msgspec.structs.replace(came, clock={})
+        comparable = None not in (kept.ended, came.ended) and not kept.real_time
+        return "conflict" if comparable and not alike else "duplicate"
+
     def give(self, scenario: Scenario) -> None:
         """Hand a scenario to an idle worker, or to a new one."""
         idle = next((w for w in self._workers if w.job is None), None) or self._start()
@@ -138,7 +194,7 @@ class _Pool:
             if not one.worker.listen(partial(self._take, one)):
                 why = one.worker.end()
                 began = not (one.ran and one.silent) or one.worker.question is not None
-                lost += self._lost(one, why, began=began, in_engine=one.worker.in_engine)
+                lost += self._lost(one, why, began=began, in_engine=one.worker.in_engine, away=one.worker.away)
             elif one.job is None:
                 continue
             elif (question := one.worker.question) is not None:
@@ -189,11 +245,8 @@ class _Pool:
 
     def _keep(self, scenario: Scenario, done: Done) -> None:
         """The record of a scenario that is over, and its log, are written and told."""
-        try:
-            record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
-        except RunError:
-            record = None
-        if record is None or record.scenario != scenario.id:
+        record = self._record_of(scenario, done)
+        if record is None:
             self.give_up(scenario, "its record was damaged when it arrived")
         elif done.again:
             self._again.append(_Lost(scenario, record.reason, in_engine=True))
@@ -201,13 +254,23 @@ class _Pool:
             self._folder.keep(record, done.log)
             self._over(scenario, record.status)
 
-    def _lost(self, one: _Slot, why: str, *, began: bool = True, in_engine: bool = False) -> list[_Lost]:
+    def _record_of(self, scenario: Scenario, done: Done) -> Record | None:
+        """The record in a result; None if it is damaged, or of another scenario."""
+        try:
+            record = Record.decoded(done.record, self._folder.episode_folder(scenario.id))
+        except RunError:
+            return None
+        return record if record.scenario == scenario.id else None
+
+    def _lost(
+        self, one: _Slot, why: str, *, began: bool = True, in_engine: bool = False, away: bool = False
+    ) -> list[_Lost]:
         """A worker has ended. Returns its scenario if that is not done, and why, if it was begun."""
         self._workers.remove(one)
         if one.job is None:
             return []
         if one.ready:
-            return [_Lost(one.job, why if began else "", in_engine)]
+            return [_Lost(one.job, why if began else "", in_engine, away)]
         self._not_started(one, why)
         return [_Lost(one.job, "")]
 

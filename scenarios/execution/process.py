@@ -33,12 +33,18 @@ _CODE: Final = (
 
 
 class LocalProcesses:
-    """Workers that are processes of this machine. logs: the folder for what they print."""
+    """Workers that are processes of this machine, so many `jobs`. logs: the folder for what they print."""
 
-    def __init__(self, logs: Path) -> None:
-        self._logs = logs
+    def __init__(self, logs: Path, jobs: int = 1) -> None:
+        self._logs, self._jobs = logs, jobs
         self._started = 0
         self._processes: list[KeptProcess] = []
+
+    def room(self, busy: int) -> int:
+        return self._jobs - busy
+
+    def unasked(self) -> tuple[()]:
+        return ()
 
     def start(self, hello: Hello) -> KeptProcess:
         process = KeptProcess(self._logs / f"worker-{self._started}.log", _WORKER, "environment")
@@ -61,7 +67,7 @@ class KeptProcess:
         self.log, self.open, self._called = str(log), True, called
         self._asked = Asked.new()
         self._last_asked: Question | None = None
-        self.in_engine = False
+        self.in_engine = self.away = False
         ours, theirs = socket.socketpair()
         self.wire = Wire(ours)
         given = (theirs.fileno(), self._asked.descriptor, *also)

@@ -94,14 +94,14 @@ def run(
         done = held.finished()
         todo = [scenario for scenario in picked if scenario.id not in done]
         if isinstance(policy, str):
-            transport: Transport = LocalProcesses(held.path / "logs")
+            transport: Transport = LocalProcesses(held.path / "logs", jobs)
         else:
             transport = InProcess(driver)
         hello = Hello(name, driver.manifest, driver.source_hash)
         renderer = None
         if shared_renderer and todo:
             renderer = stack.enter_context(SharedRenderer(held.path / "logs", hello, asks=asks))
-        run_all(held, todo, hello, transport, jobs=jobs, tell=tell, options=options, renderer=renderer)
+        run_all(held, todo, hello, transport, tell=tell, options=options, renderer=renderer)
         return held.finish()
 
 

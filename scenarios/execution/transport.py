@@ -7,11 +7,12 @@ so that a worker needs no folder of the run's.
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable, Iterable
+from typing import Literal, NamedTuple, Protocol
 
 from cosim.episode.driver import Driver
 from scenarios.execution.asked import Question
-from scenarios.execution.messages import Hear, Hello, Job
+from scenarios.execution.messages import Done, Hear, Hello, Job
 from scenarios.execution.worker import run_job
 
 
@@ -30,6 +31,10 @@ class Worker(Protocol):
     def in_engine(self) -> bool:
         """Whether it was a fault of compiled code that ended it, while its policy was asked nothing."""
 
+    @property
+    def away(self) -> bool:
+        """Whether it has left, or was lost with all that is beside it: its end tells nothing of its episode."""
+
     def give(self, job: Job) -> None:
         """Hand it a job. One that has died does not hear it: the next `listen` tells."""
 
@@ -47,8 +52,33 @@ class Worker(Protocol):
         """Wait until it has ended, by force if need be. Returns how it ended, in words."""
 
 
+Reception = Literal["kept", "duplicate", "conflict", "refused"]
+"""What became of a result: kept; there already, alike; there already, with other content; of no use."""
+
+
+class GoesOn(NamedTuple):
+    """A worker that runs a scenario of this run though nobody here has given it that: the run was begun anew, or had
+    given it up for lost."""
+
+    scenario: str
+    worker: Worker
+
+
+class Late(NamedTuple):
+    """A result from a worker that the job had been taken from. answer: to be told what became of it."""
+
+    done: Done
+    answer: Callable[[Reception], None]
+
+
 class Transport(Protocol):
     """Starts workers. A worker tells that it is `Ready` or `Unable` before it says anything else."""
+
+    def room(self, busy: int) -> int:
+        """How many more jobs can be given now, while so many are."""
+
+    def unasked(self) -> Iterable[GoesOn | Late]:
+        """What has come without having been asked for since the last time."""
 
     def start(self, hello: Hello) -> Worker:
         """One more worker. Raises MachineError when there can be none."""
@@ -66,6 +96,12 @@ class InProcess:
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
 
+    def room(self, busy: int) -> int:
+        return 1 - busy
+
+    def unasked(self) -> tuple[()]:
+        return ()
+
     def start(self, hello: Hello) -> _Here:
         return _Here(self._driver)
 
@@ -78,7 +114,7 @@ class _Here:
 
     log = "this process's own output"
     question: Question | None = None
-    in_engine = False
+    in_engine = away = False
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver

@@ -133,7 +133,7 @@ def test_a_run_gives_signs_of_life_while_it_compares(scenario: Scenario, tmp_pat
     with RunFolder.create(tmp_path / "run", spec, short) as folder:
         options = EpisodeOptions(camera="bullet", counterfactual=True)
         hello, transport = Hello("orca", manifest, driver.source_hash), LocalProcesses(folder.path / "logs")
-        run_all(folder, short.scenarios, hello, transport, jobs=1, tell=told.append, options=options)
+        run_all(folder, short.scenarios, hello, transport, tell=told.append, options=options)
     assert [type(message) for message in told] == [Progress] * 5 + [Compares] * 5 + [Done]
     assert [message.share for message in told if isinstance(message, Compares)] == [0.0, 0.2, 0.4, 0.6, 0.8]
 

@@ -151,6 +151,7 @@ class Fake:
     """A worker that says what a test has prepared, and then nothing; or it ends."""
 
     log = "worker-0.log"
+    away = False
 
     def __init__(
         self, *messages: Message, asks: PolicyCall | None = None, ends: bool = False, in_engine: bool = False
@@ -183,6 +184,12 @@ class Prepared:
 
     def __init__(self, *fakes: Fake) -> None:
         self.waiting = iter(fakes)
+
+    def room(self, busy: int) -> int:
+        return 1 - busy
+
+    def unasked(self) -> tuple[()]:
+        return ()
 
     def start(self, hello: Hello) -> Fake:
         return next(self.waiting)
@@ -224,7 +231,7 @@ def all_pooled(
     hello = Hello("stop", driver.manifest, driver.source_hash)
     with RunFolder.create(folder / "run", spec, suite) as held:
         given = {"tell": lambda _: None, "patience": Patience(**named), "renderer": renderer}
-        pool.run_all(held, suite.scenarios, hello, transport, jobs=1, **given)
+        pool.run_all(held, suite.scenarios, hello, transport, **given)
         assert next(transport.waiting, None) is None and held.finished() == set(spec.scenarios)
     return sorted(read_records(folder / "run"), key=lambda record: record.scenario)
 
@@ -447,7 +454,7 @@ def test_a_policy_that_counts_its_episodes_does_not_learn_which_they_are(tmp_pat
         )  # fmt: skip
         hello = Hello("stop", load_policy("stop").manifest, "")
         with RunFolder.create(folder, spec, suite) as held:
-            pool.run_all(held, suite.scenarios, hello, Prepared(notes), jobs=1, tell=lambda _: None)
+            pool.run_all(held, suite.scenarios, hello, Prepared(notes), tell=lambda _: None)
         assert {job.options.seed for job in notes.given} == {seed}
         order = [job.scenario.id for job in notes.given]
         assert orders.setdefault(seed, order) == order

@@ -80,7 +80,7 @@ def test_a_suite_has_the_same_results_over_every_transport(tmp_path: Path, monke
     camera frames; a policy object runs in this process, a named one in processes."""
     used = []
     for kind in (InProcess, LocalProcesses):
-        monkeypatch.setattr(suite_run, kind.__name__, lambda of, kind=kind: (used.append(kind), kind(of))[1])
+        monkeypatch.setattr(suite_run, kind.__name__, lambda *of, kind=kind: (used.append(kind), kind(*of))[1])
     one = msgspec.structs.replace(small_scenario(), time_limit_s=1.0)
     suite = Suite(name="two", version="1", scenarios=(one, msgspec.structs.replace(one, id="other", seed=5)))
     options = EpisodeOptions(seed=7, camera="bullet", frames_every_s=0.5)
