@@ -151,9 +151,17 @@ class Session:
         hears = zenoh.handlers.Callback(heard, over, indirect=False)
         self._session.get(key, hears, payload=payload, timeout=timeout_s, consolidation=zenoh.ConsolidationMode.NONE)
 
-    def stand(self, key: str) -> None:
-        """Be seen at `key` by those who `watch` it, as long as this session is there."""
-        self._tokens.append(self._session.liveliness().declare_token(key))
+    def stand(self, key: str) -> Callable[[], None]:
+        """Be seen at `key` by those who `watch` it, as long as this session is there, or until what is returned is
+        called."""
+        token = self._session.liveliness().declare_token(key)
+        self._tokens.append(token)
+
+        def leave() -> None:
+            self._tokens.remove(token)
+            token.undeclare()  # type: ignore[no-untyped-call]
+
+        return leave
 
     def watch(self, key: str, heard: Callable[[str, bool], None]) -> None:
         """Call `heard(key, there)` for everybody who `stand`s at a key expression now or later, and when they go."""

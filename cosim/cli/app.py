@@ -23,6 +23,7 @@ from cosim.cli.results.compare import compare_app
 from cosim.cli.results.report import report_app
 from cosim.cli.results.score import score_app
 from cosim.cli.results.show import show_app
+from cosim.cli.runs.coordinator import coordinator_app
 from cosim.cli.runs.counterfactual import counterfactual_app
 from cosim.cli.runs.merge import merge_app
 from cosim.cli.runs.replay import replay_app
@@ -46,7 +47,7 @@ app = typer.Typer(
 for commands in (
     *(run_app, list_app, show_app, installation_app),
     *(look_app, film_app, report_app, replay_app, export_app, counterfactual_app),
-    *(live_app, direct_app, merge_app),
+    *(live_app, direct_app, merge_app, coordinator_app),
     *(bench_app, score_app, compare_app),
 ):
     app.add_typer(commands)

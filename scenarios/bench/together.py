@@ -67,9 +67,7 @@ def driving_together(environments: int = ENVIRONMENTS, *, shared: bool = True) -
         renderer = stack.enter_context(SharedRenderer(logs, hello, asks=True)) if shared else None
         with suppress(_Enough):
             processes = LocalProcesses(logs, environments)
-            run_all(
-                held, picked, hello, processes, tell=watch.hear, options=options, renderer=renderer
-            )
+            run_all(held, picked, hello, processes, tell=watch.hear, options=options, renderer=renderer)
     how = "shared renderer and batched policy" if shared else "each with its own renderer and policy"
     rate, reach = watch.rate(), 60.0 if shared and environments == ENVIRONMENTS else None
     return [Figure(f"{environments} environments, {how}, simulated s per s in all", rate, reach=reach, better=MORE)]

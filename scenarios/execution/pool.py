@@ -3,10 +3,10 @@
 A worker that dies (SUMO and PyBullet can take its process down) is replaced and its scenario tried once more; an engine
 that shows no sign of life is killed. After the last attempt the episode is recorded, so that none is ever lost: as
 invalid if it was an engine that failed, as crashed if that may have been the policy, which gets nothing out of ending
-its process. A worker that is lost together with its machine is no attempt: its scenario goes to another one, and what the
-first one still delivers is taken if it comes first. When a shared renderer dies, the episodes that it drew for are run again. A policy that gives no answer in
-time is not asked again: its episode has crashed. What comes out of an episode is written here, by the run's own
-process.
+its process. A worker that is lost together with its machine is no attempt: its scenario goes to another one, and what
+the first one still delivers is taken if it comes first. When a shared renderer dies, the episodes that it drew for are
+run again. A policy that gives no answer in time is not asked again: its episode has crashed. What comes out of an
+episode is written here, by the run's own process.
 """
 
 from __future__ import annotations

@@ -21,7 +21,7 @@ from scenarios.execution.asked import Asked, Question
 from scenarios.execution.messages import Hear, Hello, Job, decode_message, encode_message
 from scenarios.execution.wire import Wire
 
-_WORKER: Final = "scenarios.execution.worker:serve_jobs"
+WORKER: Final = "scenarios.execution.worker:serve_jobs"
 ENDING_S: Final = 10.0
 """What a process is left to end by itself, and then its shepherd to clear up."""
 _FAULTS: Final = tuple(-fault for fault in (SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV))
@@ -47,7 +47,7 @@ class LocalProcesses:
         return ()
 
     def start(self, hello: Hello) -> KeptProcess:
-        process = KeptProcess(self._logs / f"worker-{self._started}.log", _WORKER, "environment")
+        process = KeptProcess(self._logs / f"worker-{self._started}.log", WORKER, "environment")
         process.send(encode_message(hello))
         self._started += 1
         self._processes.append(process)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shlex
 import sys
-from contextlib import ExitStack
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
 from datetime import datetime
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated, Any, get_args
 
 import msgspec
 import typer
@@ -25,12 +26,14 @@ from cosim.cli.options.street import (
     ROBOT_HELP,
     VEHICLES_SHARE,
 )
+from cosim.cli.options.taking import taking
 from cosim.cli.terminal.board import Board
 from cosim.cli.terminal.consoles import err, out
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
 run_app = typer.Typer()
+Carrier = Callable[..., AbstractContextManager[Any]]
 
 _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
@@ -43,25 +46,7 @@ _SHARD_HELP = "Run only every N-th scenario, from the I-th on; needs --seed. `co
 _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 
 
-@run_app.command(
-    "run",
-    epilog="Examples:  \n"
-    "`cosim run long-horizon --policy route --episodes 2`  \n"
-    "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
-    "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
-    "`cosim run long-horizon --robot scout --episodes 2`  \n"
-    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
-    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
-    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
-    "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
-    "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
-    "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
-    "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
-    "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
-    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n"
-    "`cosim run reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
-)
-def run_command(
+def carry_out(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
     policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
     robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
@@ -113,8 +98,10 @@ def run_command(
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
+    carrier: Carrier | None = None,
 ) -> None:
-    """Run a suite with a policy and print its table."""
+    """Do what is asked by the options of `cosim run`. carrier: what reaches the workers, in place of processes of this
+    machine: (held folder, scenarios to run, those of the run, hello, patience, tell) -> (transport, tell)."""
     from bridge import keys
     from bridge.session import notices_of, open_session
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
@@ -129,11 +116,12 @@ def run_command(
     from scenarios.builders.fits import LOOKING, check_places
     from scenarios.catalog import load_suite, scenarios_chosen, with_crowd, with_robot
     from scenarios.execution.asked import Patience
-    from scenarios.execution.messages import Hello
+    from scenarios.execution.messages import Hear, Hello
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.pool import run_all
     from scenarios.execution.process import LocalProcesses
     from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
+    from scenarios.execution.transport import Transport
     from scenarios.rendering.shared import SharedRenderer, check_shared
 
     asked_latency_ms(latency, real_time)
@@ -176,8 +164,8 @@ def run_command(
     stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
     suffix = "" if part is None else f"-{part.number}-of-{part.of}"
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}{suffix}"
-    with doing(LOOKING) as tell:
-        check_places(whole, picked, tell)
+    with doing(LOOKING) as looking:
+        check_places(whole, picked, looking)
     named = keys.chunk(path.name)
     on_air = None if air is None else Live(connection=air, run=named)
     outside = None if away is None else Outside(connection=away, run=named, wait_s=director_wait)
@@ -213,7 +201,7 @@ def run_command(
         todo = [s for s in picked if s.id not in done]
         if done:
             err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
-        if todo:
+        if todo and carrier is None:
             words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         board = Board(picked, done, compared=counterfactual)
@@ -222,19 +210,17 @@ def run_command(
         if shared_renderer and todo:
             drawing = SharedRenderer(held.path / "logs", hello, asks=asks, patience=patience)
             renderer = stack.enter_context(drawing)
+        transport: Transport = LocalProcesses(held.path / "logs", jobs)
         try:
-            with board.bars, remembered(held, todo, jobs):
-                run_all(
-                    held,
-                    todo,
-                    hello,
-                    LocalProcesses(held.path / "logs"),
-                    jobs=jobs,
-                    tell=board.tell,
-                    options=options,
-                    patience=patience,
-                    renderer=renderer,
-                )
+            with ExitStack() as running:
+                tell: Hear = board.tell
+                if carrier is None:
+                    running.enter_context(remembered(held, todo, jobs))
+                elif todo:
+                    carried = carrier(held, todo, picked, hello, patience, tell)
+                    transport, tell = running.enter_context(carried)
+                running.enter_context(board.bars)
+                run_all(held, todo, hello, transport, tell=tell, options=options, patience=patience, renderer=renderer)
         except KeyboardInterrupt:
             finished = len(held.finished())
             again = shlex.join(a for a in sys.argv[1:] if a != "--resume")
@@ -253,3 +239,27 @@ def run_command(
     if lacking or table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
     write_rerun(path, [scenario.id for scenario in picked], rerun)
+
+
+@run_app.command(
+    "run",
+    epilog="Examples:  \n"
+    "`cosim run long-horizon --policy route --episodes 2`  \n"
+    "`cosim run reactive --event frontal --event lateral --policy orca`  \n"
+    "`cosim run long-horizon --policy orca --episodes 2 --residents 8`  \n"
+    "`cosim run long-horizon --robot scout --episodes 2`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 2 --out runs/mine`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
+    "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
+    "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
+    "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
+    "`cosim run reactive --director tcp/127.0.0.1:7448`, with `cosim direct` beside it  \n"
+    "`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n"
+    "`cosim run reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
+)
+@taking(carry_out, without=("carrier",))
+def run_command(**asked: Any) -> None:
+    """Run a suite with a policy and print its table."""
+    carry_out(**asked)

@@ -1,0 +1,105 @@
+"""`cosim coordinator`, `cosim worker`: a run by many machines."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from signal import SIGINT
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, listening, warned
+from cosim.cli.options.panels import MANY
+from cosim.cli.options.taking import taking
+from cosim.cli.runs.run import carry_out
+from cosim.cli.terminal.consoles import err
+from cosim.core.errors import INTERRUPTED
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from cosim.records.run_folder import RunFolder
+    from cosim.spec.scenario import Scenario
+    from scenarios.execution.asked import Patience
+    from scenarios.execution.messages import Hear, Hello
+    from scenarios.execution.transport import Transport
+
+coordinator_app = typer.Typer()
+
+_OF_ONE_MACHINE = (
+    "carrier", "jobs", "shared_renderer", "live", "director", "director_wait", "real_time", "shard", "tls", "insecure",
+)  # fmt: skip
+
+
+@coordinator_app.command(
+    rich_help_panel=MANY,
+    epilog="Examples:  \n`cosim coordinator reactive --policy orca --out runs/mine`, and on the same machine "
+    "`cosim worker --jobs 2`  \n"
+    "`cosim coordinator reactive --policy orca --out runs/mine --resume`, after it was stopped or killed  \n"
+    "`cosim coordinator reactive --policy my_robot.policy:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
+)
+@taking(carry_out, without=_OF_ONE_MACHINE)
+def coordinator(
+    listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where workers find it.")] = DEFAULT,
+    tls: Tls = "",
+    insecure: Insecure = False,
+    **asked: Any,
+) -> None:
+    """Run a suite by workers that come and go (`cosim worker`): with the options of `cosim run`, and the same results.
+
+    It waits for workers as long as there is something to do. Killed at any moment, and begun again with --resume, it
+    goes on where it was, and so do they. `cosim status` tells how it goes.
+    """
+    from bridge.session import open_session
+    from scenarios.many.workers import joined
+
+    connection = listening("coordinator", "--listen", listen, tls, insecure)
+
+    @contextmanager
+    def carried(
+        held: RunFolder, todo: Sequence[Scenario], picked: Sequence[Scenario], hello: Hello, patience: Patience,
+        tell: Hear,
+    ) -> Iterator[tuple[Transport, Hear]]:  # fmt: skip
+        resumed = bool(asked["resume"])
+        with (
+            open_session(connection, warned) as session,
+            joined(session, held, todo, picked, hello, patience, tell, resumed=resumed) as workers,
+        ):
+            _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
+            yield workers
+
+    carry_out(**asked, carrier=carried)
+
+
+@coordinator_app.command(
+    rich_help_panel=MANY,
+    epilog="Examples:  \n`cosim worker --jobs 2`  \n`cosim worker --connect tls/hub.lan:7447 --tls certs/worker --jobs "
+    "16 --once`  \nExit codes: 0 told to end by SIGTERM, its episodes handed back, or the run is over (--once); 2 the "
+    "run needs another installation, or its policy cannot be loaded here; 3 this machine lacks something; 130 Ctrl-C",
+)
+def worker(
+    connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where the coordinator listens.")] = DEFAULT,
+    jobs: Annotated[int, typer.Option(min=1, max=1024, help="Environment processes.")] = 1,
+    once: Annotated[bool, typer.Option("--once", help="End when a run is over; else wait for the next one.")] = False,
+    tls: Tls = "",
+    insecure: Insecure = False,
+    logs: Annotated[
+        Path | None, typer.Option(help="Keep here what its processes print; else the run alone keeps it.")
+    ] = None,
+) -> None:
+    """Run episodes for a coordinator (`cosim coordinator`), on this machine or another one.
+
+    It needs no folder of the run's: scenarios, options and the policy's name come from there. The policy itself must be
+    importable here, and be the same. It may come and go at any time.
+    """
+    from scenarios.many.supervisor import work
+
+    connection = connecting("worker", "--connect", connect, tls, insecure)
+    if work(connection, jobs, _say, once=once, logs=logs) == SIGINT:
+        raise typer.Exit(INTERRUPTED)
+
+
+def _say(words: str) -> None:
+    err.print(words, soft_wrap=True, highlight=False, markup=False)

@@ -1,0 +1,397 @@
+"""Workers on other machines, as a transport: whenever they are free they ask the run's coordinator for jobs.
+
+Threads of Zenoh's only put what they hear into a queue; all else is done by the thread of the run, when it waits.
+"""
+
+from __future__ import annotations
+
+import queue
+import secrets
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Final, NamedTuple
+
+import msgspec
+
+from bridge import keys
+from bridge.codec import decode
+from bridge.session import Query, Session
+from cosim.core.errors import EngineError
+from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.spec.scenario import Scenario
+from scenarios.execution.asked import Patience, Question
+from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Message, Ready
+from scenarios.execution.transport import GoesOn, Late, Reception
+from scenarios.many.roll import Roll
+from scenarios.many.words import (
+    MOST_SENT_BYTES,
+    Claim,
+    GoOn,
+    Lease,
+    LetGo,
+    NoResult,
+    NothingNow,
+    Over,
+    Received,
+    Renewal,
+    Reply,
+    Result,
+    TurnedAway,
+    Welcome,
+    digest_of,
+    installed_here,
+    reply_in_bytes,
+    run_hash,
+)
+
+LEASE_S: Final = 15.0
+"""A worker that does not renew its lease for so long has lost it, whatever Zenoh says of it."""
+HELD_S: Final = 2.0
+"""A claim is answered after so long even when there is nothing to do."""
+GRACE_S: Final = 3.0
+"""A run that is begun anew gives no jobs for so long: who works on one tells so first."""
+_PARTING_S: Final = 3.0
+"""How long those who ask are told that the run is over."""
+
+
+class _Departed(NamedTuple):
+    """A worker is not seen any more."""
+
+    worker: str
+
+
+class RemoteWorkers:
+    """A transport (`scenarios.execution.transport`) to all workers that come to a session.
+
+    hello, patience: of the run. resumed: whether others may work for it already. roll: who is there and what is odd.
+    """
+
+    def __init__(
+        self, session: Session, spec: RunSpec, hello: Hello, patience: Patience, roll: Roll, *, resumed: bool = False
+    ) -> None:
+        self.run = run_hash(spec)
+        self._session, self._spec, self._hello, self._patience, self._roll = session, spec, hello, patience, roll
+        self._installed = msgspec.structs.replace(installed_here(), versions=spec.versions)
+        self._inbox: queue.SimpleQueue[tuple[str, Query] | _Departed] = queue.SimpleQueue()
+        self._claims: dict[tuple[str, int], tuple[Query, float]] = {}
+        self._leased: dict[tuple[str, int], _Remote] = {}
+        self._unasked: list[GoesOn | Late] = []
+        self._number = secrets.randbits(48)
+        self._opens_at = time.monotonic() + (GRACE_S if resumed else 0.0)
+        self._over = False
+        self._taken: dict[str, Callable[[Query], None]] = {
+            "claim": self._claimed,
+            "renew": self._renewed,
+            "result": self._delivered,
+            "failed": self._failed,
+            "status": self._told,
+        }
+
+    def open(self) -> None:
+        """From now on workers are heard."""
+        for act in ("claim", "renew", "result", "failed"):
+            self._session.collect(keys.job(self.run, act), self._taken_in(act))
+        self._session.collect(keys.status(self.run), self._taken_in("status"), found=True)
+        self._session.watch(keys.worker(self.run, "*"), self._seen)
+
+    def room(self, busy: int) -> int:
+        return len(self._claims) if time.monotonic() >= self._opens_at else 0
+
+    def start(self, hello: Hello) -> _Remote:
+        """The worker that has waited longest. Its first job must be given at once."""
+        at, (query, _) = next(iter(self._claims.items()))
+        del self._claims[at]
+        self._number += 1
+        one = self._leased[at] = _Remote(self, at, self._number, query)
+        return one
+
+    def unasked(self) -> Iterable[GoesOn | Late]:
+        found, self._unasked = self._unasked, []
+        return found
+
+    def wait(self, timeout_s: float) -> None:
+        """Take in all that has come; if nothing has, wait for something."""
+        try:
+            one = self._inbox.get(timeout=timeout_s)
+            while True:
+                self._take(one)
+                one = self._inbox.get_nowait()
+        except queue.Empty:
+            pass
+        now_s = time.monotonic()
+        for at, (query, since_s) in list(self._claims.items()):
+            if now_s - since_s > HELD_S:
+                del self._claims[at]
+                query.answer(reply_in_bytes(NothingNow()))
+        self._roll.tend()
+
+    def part(self) -> None:
+        """The run is over: tell it to those who ask, for a while."""
+        self._over = True
+        until_s = time.monotonic() + _PARTING_S
+        for query, _ in self._claims.values():
+            query.answer(reply_in_bytes(Over()))
+        self._claims.clear()
+        while self._roll.anybody and (left_s := until_s - time.monotonic()) > 0.0:
+            self.wait(left_s)
+
+    def _taken_in(self, act: str) -> Callable[[Query], None]:
+        return lambda query: self._inbox.put((act, query))
+
+    def forget(self, one: _Remote) -> None:
+        """The lease of a worker has ended."""
+        if self._leased.get(one.at) is one:
+            del self._leased[one.at]
+
+    def ended_late(self, one: _Remote) -> None:
+        """A worker did not renew its lease."""
+        self._roll.note(f"{one.name} has not renewed its lease of {one.scenario} for {LEASE_S:g} s")
+
+    def _seen(self, key: str, there: bool) -> None:
+        if not there:
+            self._inbox.put(_Departed(key.rpartition("/")[2]))
+
+    def _take(self, one: tuple[str, Query] | _Departed) -> None:
+        if isinstance(one, _Departed):
+            self._lose(one.worker)
+            return
+        act, query = one
+        try:
+            if len(query.payload) > MOST_SENT_BYTES + 4096:
+                raise EngineError(f"{len(query.payload)} bytes are more than a message may have")
+            self._taken[act](query)
+        except EngineError as error:
+            self._roll.odd(f"what came to '{act}' was refused: {error}")
+            query.refuse(str(error)[:500])
+
+    def _lose(self, worker: str) -> None:
+        """A worker is gone, or cut off: all its jobs are free. What it says again later is heard."""
+        self._roll.gone(worker)
+        for at in [at for at in self._claims if at[0] == worker]:
+            self._claims.pop(at)[0].answer(reply_in_bytes(NothingNow()))
+        for one in [one for at, one in self._leased.items() if at[0] == worker]:
+            one.lose(f"worker {worker} was lost")
+
+    def _claimed(self, query: Query) -> None:
+        claim = decode(query.payload, Claim)
+        at = (claim.worker, claim.slot)
+        if self._over:
+            self._roll.left(claim.worker)
+            query.answer(reply_in_bytes(Over()))
+            return
+        if other := claim.installed.differs_from(self._installed):
+            self._roll.refused(claim.worker, claim.host, other)
+            why = f"this run needs another installation than that of {claim.host}, which has {other}: install the same"
+            query.answer(reply_in_bytes(TurnedAway(why)))
+            return
+        self._roll.heard(claim.worker, claim.host, claim.slot)
+        if not claim.ready:
+            query.answer(reply_in_bytes(Welcome(self._hello, self._installed, self._patience)))
+            return
+        one = self._leased.get(at)
+        if one is not None and one.job is not None:  # the answer to its last claim was lost
+            query.answer(reply_in_bytes(Lease(one.number, one.job)))
+            return
+        if one is not None:
+            one.lose(f"worker {claim.worker} does not go on with it")
+        if at in self._claims:
+            self._claims.pop(at)[0].answer(reply_in_bytes(NothingNow()))
+        self._claims[at] = (query, time.monotonic())
+
+    def _renewed(self, query: Query) -> None:
+        renewal = decode(query.payload, Renewal)
+        self._roll.renewed(renewal)
+        at = (renewal.worker, renewal.slot)
+        one = self._leased.get(at)
+        if one is None or one.number != renewal.lease:
+            if self._over or one is not None:
+                query.answer(reply_in_bytes(LetGo()))
+                return
+            one = self._leased[at] = _Remote(self, at, renewal.lease, None, renewal.scenario)
+            self._unasked.append(GoesOn(renewal.scenario, one))
+        one.renew(renewal, query)
+
+    def _delivered(self, query: Query) -> None:
+        result = decode(query.payload, Result)
+        if digest_of(result.record, result.log) != result.digest:
+            raise EngineError("the result was damaged on its way")
+        one = self._leased.get((result.worker, result.slot))
+        one = one if one is not None and one.number == result.lease else None
+        if other := self._of_another(result):
+            self._roll.refused(result.worker, "", other)
+            if one is not None:
+                one.lose(f"its worker was turned away: {other}")
+            query.answer(reply_in_bytes(TurnedAway(other)))
+            return
+        self._roll.printed(result, result.printed)
+        done = Done(result.scenario, result.status, result.record, result.log, result.again)
+        if one is not None:
+            one.deliver(done, query)
+        elif self._over:
+            self._answer_late(result, query, "duplicate")
+        else:
+            self._unasked.append(Late(done, lambda how: self._answer_late(result, query, how)))
+        self._roll.delivered(result)
+
+    def _answer_late(self, result: Result, query: Query, how: Reception) -> None:
+        name = result.worker
+        if how == "conflict":
+            self._roll.conflict(
+                f"CONFLICT: {result.scenario} by {name} came out otherwise than what is kept: the same scenario must "
+                "give the same result on every machine; the first one stays"
+            )
+        else:
+            self._roll.note(f"late result of {result.scenario} by {name}: {how}")
+        query.answer(reply_in_bytes(Received(how)))
+
+    def _of_another(self, result: Result) -> str:
+        """Why a result cannot be of this run; "" where it can, or where it is too damaged to tell."""
+        try:
+            told = msgspec.json.decode(result.record, type=_Told)
+        except msgspec.DecodeError:
+            return ""
+        run = self._spec
+        if (told.suite_hash, told.run_seed, told.policy_source) != (run.suite_hash, run.seed, run.policy_source):
+            return "its result is of another run"
+        if told.versions != run.versions:
+            return "its result is of another installation"
+        if told.ended is not None and told.renderer != run.renderer:
+            return (
+                f"its pictures are drawn by {told.renderer}, those of the run by {run.renderer}: begin the run with "
+                "--camera bullet"
+            )
+        return ""
+
+    def _failed(self, query: Query) -> None:
+        failure = decode(query.payload, NoResult)
+        one = self._leased.get((failure.worker, failure.slot))
+        self._roll.printed(failure, failure.printed)
+        if one is not None and one.number == failure.lease:
+            one.fail(failure)
+        self._roll.failed(failure)
+        query.answer(reply_in_bytes(Received()))
+
+    def _told(self, query: Query) -> None:
+        query.answer(msgspec.json.encode(self._roll.status()))
+
+
+class _Told(msgspec.Struct):
+    """What a record says of where it comes from."""
+
+    suite_hash: str
+    run_seed: int
+    policy_source: str
+    versions: dict[str, str]
+    renderer: str
+    ended: str | None = None
+
+
+class _Remote:
+    """A worker as long as it has one lease (`scenarios.execution.transport.Worker`)."""
+
+    away = in_engine = False
+
+    def __init__(
+        self, workers: RemoteWorkers, at: tuple[str, int], number: int, claim: Query | None, scenario: str = ""
+    ) -> None:
+        self.at, self.number, self.scenario = at, number, scenario
+        self.name = f"{at[0]}/{at[1]}"
+        self.log = f"logs/{at[0]}-{at[1]}.log"
+        self.job: Job | None = None
+        self._workers, self._claim = workers, claim
+        self._said: deque[tuple[Message | None, Query | None, Reply]] = deque([(Ready(), None, GoOn())])
+        self._heard_s, self._held = time.monotonic(), False
+        self._asks: Renewal | NoResult | None = None
+        self._why: str | None = None
+
+    @property
+    def question(self) -> Question | None:
+        """As old as it was when the worker last told of it: what came after that is not known here."""
+        if self._asks is None or self._asks.asks is None:
+            return None
+        return self._asks.asks.question(time.monotonic())
+
+    def give(self, job: Job) -> None:
+        self.job, self.scenario = job, job.scenario.id
+        if self._claim is not None:
+            self._claim.answer(reply_in_bytes(Lease(self.number, job)))
+
+    def renew(self, renewal: Renewal, query: Query) -> None:
+        """It is alive. It is told so once its frames are written, and once the run knows of it."""
+        self._heard_s, self._asks = time.monotonic(), renewal
+        self._said.extend((message, None, GoOn()) for message in renewal.said if message.scenario == self.scenario)
+        if self._held and not any(isinstance(message, FrameDrawn) for message in renewal.said):
+            query.answer(reply_in_bytes(GoOn()))
+        else:
+            self._said.append((None, query, GoOn()))
+
+    def deliver(self, done: Done, query: Query) -> None:
+        self._heard_s = time.monotonic()
+        self._said.append((done, query, Received()))
+
+    def fail(self, failure: NoResult) -> None:
+        """Its process has ended, or it leaves."""
+        self._asks, self.in_engine = failure, failure.in_engine
+        self.away = failure.how != "ended"
+        self._why = "" if self.away else failure.why
+
+    def lose(self, why: str) -> None:
+        if self._why is None:
+            self._why, self.away, self._asks = why, True, None
+
+    def listen(self, hear: Hear) -> bool:
+        self._held = True
+        while self._said:
+            message, query, reply = self._said.popleft()
+            if message is not None:
+                hear(message)
+            if query is not None:
+                query.answer(reply_in_bytes(reply))
+            if isinstance(message, Done):
+                self._why = ""
+        if self._why is None and time.monotonic() - self._heard_s > LEASE_S:
+            self._workers.ended_late(self)
+            self.lose(f"worker {self.at[0]} fell silent")
+        return self._why is None
+
+    def hang_up(self) -> None:
+        """It has one job, and ends with it."""
+
+    def kill(self, *, wait: bool = True) -> None:
+        """Its lease is over: when it renews it next it is told so."""
+        self._workers.forget(self)
+        for message, query, _ in self._said:
+            if query is not None and wait and not isinstance(message, Done):  # a result is sent again
+                query.answer(reply_in_bytes(LetGo()))
+        self._said.clear()
+
+    def end(self) -> str:
+        self._workers.forget(self)
+        return self._why or ""
+
+
+@contextmanager
+def joined(
+    session: Session,
+    held: RunFolder,
+    todo: Sequence[Scenario],
+    picked: Sequence[Scenario],
+    hello: Hello,
+    patience: Patience,
+    tell: Hear,
+    *,
+    resumed: bool,
+) -> Iterator[tuple[RemoteWorkers, Hear]]:
+    """The workers of a run, whose folder is held, and what is to be told of their episodes in place of `tell`.
+
+    todo: what of the run, which is `picked`, is to be run. At the end of the block, unless it failed, workers are told
+    that the run is over."""
+    roll = Roll(held, picked, len(picked) - len(todo), tell)
+    workers = RemoteWorkers(session, held.spec, hello, patience, roll, resumed=resumed)
+    workers.open()
+    roll.note(f"run {workers.run}: {len(todo)} of {len(picked)} episodes to be run")
+    yield workers, roll.tell
+    roll.note("the run is over")
+    workers.part()
