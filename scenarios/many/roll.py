@@ -106,6 +106,11 @@ class Roll:
         one.under_way.pop(slot, None)
         one.state, one.why = "working" if one.under_way else "idle", ""
 
+    def leased(self, worker: str, slot: int, scenario: str) -> None:
+        """A worker has been given a job."""
+        one = self._of(worker, "")
+        one.state, one.under_way[slot] = "working", Under(scenario, 0.0, 0.0)
+
     def renewed(self, renewal: Renewal) -> None:
         one = self._of(renewal.worker, "")
         one.state, one.why = "working", ""

@@ -89,19 +89,20 @@ def work(connection: Connection, jobs: int, say: Say, *, once: bool = False, log
         if session is None:
             return leaving.signal
         stack.enter_context(session)
-        told = ""
+        told, over, over_s = False, "", 0.0
         while not leaving.signal:
             runs = [key.split("/")[1] for key in session.answers(keys.EVERY_RUN, timeout_s=5.0)]
-            if not runs:
-                if told != "":
-                    leaving.wait([], _RETRY_S)
-                    continue
-                told = f"waits for a run at {connection.endpoint}"
-                say(told)
+            if not runs or (runs[0] == over and time.monotonic() - over_s < _PARTING_S):
+                if not told:
+                    say(f"waits for a run at {connection.endpoint}")
+                told = True
+                leaving.wait([], _RETRY_S)
                 continue
-            told = ""
-            if _Service(session, runs[0], jobs, logs, leaving, say).serve() and once:
-                return 0
+            told = False
+            if _Service(session, runs[0], jobs, logs, leaving, say).serve():
+                if once:
+                    return 0
+                over, over_s = runs[0], time.monotonic()
         return leaving.signal
 
 

@@ -52,7 +52,7 @@ HELD_S: Final = 2.0
 """A claim is answered after so long even when there is nothing to do."""
 GRACE_S: Final = 3.0
 """A run that is begun anew gives no jobs for so long: who works on one tells so first."""
-_PARTING_S: Final = 3.0
+PARTING_S: Final = 3.0
 """How long those who ask are told that the run is over."""
 
 
@@ -130,7 +130,7 @@ class RemoteWorkers:
     def part(self) -> None:
         """The run is over: tell it to those who ask, for a while."""
         self._over = True
-        until_s = time.monotonic() + _PARTING_S
+        until_s = time.monotonic() + PARTING_S
         for query, _ in self._claims.values():
             query.answer(reply_in_bytes(Over()))
         self._claims.clear()
@@ -144,6 +144,10 @@ class RemoteWorkers:
         """The lease of a worker has ended."""
         if self._leased.get(one.at) is one:
             del self._leased[one.at]
+
+    def given(self, one: _Remote) -> None:
+        """A worker has been given a job."""
+        self._roll.leased(*one.at, one.scenario)
 
     def ended_late(self, one: _Remote) -> None:
         """A worker did not renew its lease."""
@@ -191,7 +195,7 @@ class RemoteWorkers:
             query.answer(reply_in_bytes(Welcome(self._hello, self._installed, self._patience)))
             return
         one = self._leased.get(at)
-        if one is not None and one.job is not None:  # the answer to its last claim was lost
+        if one is not None and one.job is not None and not one.ended:  # the answer to its last claim was lost
             query.answer(reply_in_bytes(Lease(one.number, one.job)))
             return
         if one is not None:
@@ -313,10 +317,16 @@ class _Remote:
             return None
         return self._asks.asks.question(time.monotonic())
 
+    @property
+    def ended(self) -> bool:
+        """Whether there is nothing to be expected of this lease any more."""
+        return self._why is not None
+
     def give(self, job: Job) -> None:
         self.job, self.scenario = job, job.scenario.id
         if self._claim is not None:
             self._claim.answer(reply_in_bytes(Lease(self.number, job)))
+            self._workers.given(self)
 
     def renew(self, renewal: Renewal, query: Query) -> None:
         """It is alive. It is told so once its frames are written, and once the run knows of it."""

@@ -1,0 +1,34 @@
+"""Workers and a coordinator, as a user starts them, that are killed and stopped in the middle of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from cosim.records.run_folder import read_records
+from scenarios.many.chaos import Planned, chaos, quiet
+
+PLAN = [
+    Planned(1, "kill worker"),
+    Planned(3, "stop worker"),
+    Planned(4, "kill process"),
+    Planned(5, "kill coordinator"),
+    Planned(7, "end worker"),
+]
+
+
+@pytest.mark.engine
+def test_what_is_killed_in_a_run_of_many_workers_changes_none_of_its_results(tmp_path: Path) -> None:
+    """Twelve real episodes by three workers: one worker is killed, one stopped for a while, one told to end, an
+    environment process is killed, and so is the coordinator; one scenario kills all that run it. The table is that of a
+    quiet run to the byte, and so are the state hashes; the poison is named."""
+    reference = quiet(tmp_path, 12, jobs=1)
+    found = chaos(tmp_path, "chaos", 3, PLAN, seed=1, replaced=False)
+    said = (tmp_path / "chaos.log").read_text() + (tmp_path / "chaos-workers.log").read_text()
+    assert found.wrong == [] and sum(found.faults.values()) == len(PLAN), said
+    assert found.episodes == 12 and "Traceback" not in said
+    (poison,) = [record for record in read_records(tmp_path / "chaos") if record.status != "done"]
+    assert poison.scenario == "tiny-006" and poison.status == "crashed"
+    assert "was killed by SIGKILL in the policy's reset, 2 times" in poison.reason
+    assert len(read_records(reference)) == 12

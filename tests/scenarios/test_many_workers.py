@@ -1,0 +1,375 @@
+"""Workers of other machines and a run's coordinator, over real Zenoh sessions, without engines: who gets which job,
+what becomes of results, and what is refused."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from bridge import keys
+from bridge.codec import encode
+from bridge.session import open_session
+from cosim.core.errors import CosimError, EngineError, MachineError
+from cosim.core.versions import versions
+from cosim.policies.load import load_policy
+from cosim.records.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
+from cosim.records.run_folder import RunFolder, RunSpec, read_records
+from cosim.spec.connection import Connection
+from cosim.spec.scenario import City, Scenario, Suite
+from scenarios.execution.asked import Patience
+from scenarios.execution.messages import Hello, Progress
+from scenarios.execution.pool import ATTEMPTS, LOSSES, run_all
+from scenarios.many import workers as remote
+from scenarios.many.roll import RunStatus
+from scenarios.many.words import (
+    Asks,
+    Claim,
+    GoOn,
+    Lease,
+    LetGo,
+    NoResult,
+    NothingNow,
+    Received,
+    Renewal,
+    Reply,
+    Result,
+    TurnedAway,
+    Welcome,
+    digest_of,
+    installed_here,
+    reply_in,
+    run_hash,
+)
+from scenarios.many.workers import joined
+from tests.conftest import PATIENCE_S
+
+pytestmark = pytest.mark.engine
+
+DRIVER = load_policy("stop")
+SUITE = Suite(
+    name="s", version="1",
+    scenarios=tuple(
+        Scenario(
+            id=f"s-{i}", suite="s", place=City(seed=0), seed=i, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+            route=((0.0, 0.0), (9.0, 0.0)),
+        )
+        for i in range(2)
+    ),
+)  # fmt: skip
+SPEC = RunSpec(
+    suite="s", robots={"courier": "h"}, suite_version="1", suite_hash="h", policy="stop", policy_name="stop",
+    policy_version="1", policy_source=DRIVER.source_hash, scenarios=("s-0", "s-1"), versions=versions(), seed=3,
+    renderer=NO_RENDERER, metric_schema=METRIC_SCHEMA,
+)  # fmt: skip
+
+
+GARBAGE = (b"", b"\xc1" * 100, encode(Asks("act", 1, 1.0)), b"\x91" * 100_000, b"\xdd\xff\xff\xff\xff")
+
+
+@pytest.fixture(autouse=True)
+def _brief_partings(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody here asks again when the run is over."""
+    monkeypatch.setattr(remote, "PARTING_S", 0.0)
+
+
+class Run:
+    """A run that is coordinated in a thread of its own, in a folder of its own; killed by closing its session."""
+
+    def __init__(self, folder: Path, *, resumed: bool = False) -> None:
+        self.folder, self._resumed = folder / "run", resumed
+        self.endpoint = f"unixsock-stream/{folder}/hub.sock"
+        self.error: CosimError | None = None
+        self.opened, self._hub = threading.Event(), None
+        self._thread = threading.Thread(target=self._coordinate, daemon=True)
+        self._thread.start()
+        assert self.opened.wait(PATIENCE_S)
+
+    def over(self) -> dict[str, Record]:
+        """Wait until it is; its records."""
+        self._thread.join(PATIENCE_S)
+        assert not self._thread.is_alive()
+        return {record.scenario: record for record in read_records(self.folder)}
+
+    @property
+    def log(self) -> str:
+        return (self.folder / "logs" / "coordinator.log").read_text()
+
+    def _coordinate(self) -> None:
+        hello = Hello("stop", DRIVER.manifest, DRIVER.source_hash)
+        held = RunFolder.resume(self.folder, SPEC) if self._resumed else RunFolder.create(self.folder, SPEC, SUITE)
+        with held, open_session(Connection(role="coordinator", listen=self.endpoint)) as hub, suppress(_Killed):
+            done = held.finished()
+            todo = [one for one in SUITE.scenarios if one.id not in done]
+            try:
+                with joined(
+                    hub, held, todo, SUITE.scenarios, hello, Patience(), lambda _: None, resumed=self._resumed
+                ) as (transport, tell):
+                    self.kill = _killer(transport)
+                    self.opened.set()
+                    run_all(held, todo, hello, transport, tell=tell)
+            except MachineError as error:
+                self.error = error
+
+
+class _Killed(BaseException):
+    """The coordinator was killed."""
+
+
+def _killer(transport: remote.RemoteWorkers) -> Callable[[], None]:
+    """Make a transport raise in its thread when it waits next."""
+    wait, killed = transport.wait, threading.Event()
+
+    def until_killed(timeout_s: float) -> None:
+        wait(min(timeout_s, 0.05))
+        if killed.is_set():
+            raise _Killed
+
+    transport.wait = until_killed  # type: ignore[method-assign]
+    return killed.set
+
+
+class Hand:
+    """A worker that a test moves."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.session = open_session(Connection(role="worker", connect=endpoint))
+        self.name, self.run = f"w-{secrets.token_hex(4)}", run_hash(SPEC)
+        self.session.stand(keys.worker(self.run, self.name))
+        self.lease, self.scenario = 0, ""
+
+    def say(self, act: str, message: msgspec.Struct) -> Reply:
+        return reply_in(self.session.ask(keys.job(self.run, act), encode(message), timeout_s=PATIENCE_S))
+
+    def claim(self, *, ready: bool = True, **other: object) -> Reply:
+        installed = msgspec.structs.replace(installed_here(), **other)
+        return self.say("claim", Claim(**self.me(), host="here", installed=installed, ready=ready))
+
+    def job(self) -> str:
+        """Claim until there is a job. Returns its scenario."""
+        while not isinstance(reply := self.claim(), Lease):
+            assert isinstance(reply, NothingNow)
+        self.lease, self.scenario = reply.number, reply.job.scenario.id
+        return self.scenario
+
+    def renew(self, asks: Asks | None = None) -> Reply:
+        said = (Progress(self.scenario, 1.0, 4.5, 0),)
+        return self.say("renew", Renewal(**self.me(), lease=self.lease, scenario=self.scenario, asks=asks, said=said))
+
+    def result(self, *, of: str = "", ticks: int = 40, record: Record | None = None) -> Result:
+        name = of or self.scenario
+        scenario = next(one for one in SUITE.scenarios if one.id == name)
+        record = record or msgspec.structs.replace(
+            begun(scenario, DRIVER.manifest, "h", DRIVER.source_hash, SPEC.seed), status="done", ended="goal",
+            ticks=ticks, state_hash=f"hash-{ticks}", clock={"wall_s": time.monotonic()},
+        )  # fmt: skip
+        data = record.encoded()
+        return Result(
+            **self.me(), lease=self.lease, scenario=name, status="done", record=data, log=b"log", again=False,
+            digest=digest_of(data, b"log"),
+        )  # fmt: skip
+
+    def deliver(self, **named: object) -> Reply:
+        return self.say("result", self.result(**named))
+
+    def fail(self, how: str = "ended", why: str = "its process was killed by SIGKILL") -> Reply:
+        failure = NoResult(**self.me(), lease=self.lease, scenario=self.scenario, how=how, why=why)
+        return self.say("failed", failure)
+
+    def me(self) -> dict[str, object]:
+        return {"worker": self.name, "slot": 0}
+
+    def status(self) -> RunStatus:
+        (told,) = self.session.answers(keys.EVERY_RUN, timeout_s=PATIENCE_S).values()
+        return msgspec.json.decode(told, type=RunStatus)
+
+
+@contextmanager
+def hands(run: Run, count: int) -> Iterator[list[Hand]]:
+    with ExitStack() as stack:
+        found = [Hand(run.endpoint) for _ in range(count)]
+        for one in found:
+            stack.enter_context(one.session)
+        yield found
+
+
+def until(true: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not true():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
+    """A newcomer learns the policy; an answer that was lost is given again; a second result changes nothing, one of
+    other content is told loudly; the first one stays."""
+    run = Run(tmp_path)
+    with hands(run, 2) as (one, other):
+        welcome = one.claim(ready=False)
+        assert isinstance(welcome, Welcome) and welcome.hello.policy == "stop"
+        first = one.job()
+        assert one.job() == first and one.renew() == GoOn()
+        assert other.job() != first
+        working = {w.name: [u.scenario for u in w.under_way] for w in one.status().workers}
+        assert working[one.name] == [first]
+        assert one.deliver() == Received("kept") and one.deliver() == Received("duplicate")
+        assert one.deliver(ticks=41) == Received("conflict")
+        assert len(one.status().conflicts) == 1 and one.status().finished == 1
+        assert other.deliver() == Received("kept")
+        records = run.over()
+    assert {name: record.state_hash for name, record in records.items()} == {"s-0": "hash-40", "s-1": "hash-40"}
+    assert f"CONFLICT: {first} by {one.name}" in run.log
+
+
+def test_the_job_of_a_lost_worker_is_free_at_once(tmp_path: Path) -> None:
+    """Another one gets it; who was taken for lost is told to let go, and a result that it has all the same is taken,
+    if it is the first."""
+    run = Run(tmp_path)
+    with hands(run, 3) as (lost, other, third):
+        first = lost.job()
+        lost.session.close()
+        assert other.job() == first
+        lost.session = open_session(Connection(role="worker", connect=run.endpoint))
+        with lost.session:
+            assert lost.renew() == LetGo()
+            assert lost.deliver() == Received("kept")
+            assert other.renew() == LetGo() and other.deliver() == Received("duplicate")
+        assert third.job() != first and third.deliver() == Received("kept")
+        assert len(run.over()) == 2
+    assert f"{lost.name}: lost" in run.log
+
+
+def test_who_comes_back_goes_on(tmp_path: Path) -> None:
+    """A worker whose job nobody has taken since it was cut off keeps it."""
+    run = Run(tmp_path)
+    with hands(run, 1) as (one,):
+        one.job()
+        one.session.close()
+        until(lambda: f"{one.name}: lost" in run.log)
+        one.session = open_session(Connection(role="worker", connect=run.endpoint))
+        with one.session:
+            assert one.renew() == GoOn() and one.deliver() == Received("kept")
+            one.job()
+            assert one.deliver() == Received("kept")
+        assert len(run.over()) == 2
+
+
+def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither who works nor who is done with its job loses anything when the coordinator is killed."""
+    monkeypatch.setattr(remote, "GRACE_S", PATIENCE_S)  # nothing can be given before both have told
+    run = Run(tmp_path)
+    with hands(run, 2) as (one, other):
+        names = {one.job(), other.job()}
+        run.kill()
+        assert run.over() == {}
+        run = Run(tmp_path, resumed=True)
+        assert one.renew() == GoOn()
+        assert one.deliver() == Received("kept") and other.deliver() == Received("kept")
+        assert set(run.over()) == names
+
+
+def test_attempts_are_bounded_and_leaving_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scenario that ends its process is tried twice, one that is lost with its worker eight times, one that is handed
+    back as often as that happens; then they are named."""
+    run = Run(tmp_path)
+    with hands(run, 1) as (one,):
+        poison = one.job()
+        for _ in range(ATTEMPTS + 1):
+            assert one.fail("released", "") == Received()
+            assert one.job() == poison
+        for _ in range(ATTEMPTS):
+            assert one.job() == poison
+            one.fail()
+        unlucky = one.job()
+        assert unlucky != poison
+        for losses in range(1, LOSSES):
+            with hands(run, 1) as (another,):
+                one.session.close()
+                assert another.job() == unlucky
+            until(lambda losses=losses: run.log.count("lost, with") > losses)
+        records = run.over()
+    assert records[poison].status == "crashed" and "killed by SIGKILL, 2 times" in records[poison].reason
+    assert records[unlucky].status == "crashed" and f"was lost, {LOSSES} times" in records[unlucky].reason
+
+
+def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
+    """Garbage, damaged and oversized messages, other runs, scenarios and installations, keys with wildcards: nothing is
+    changed by any, and the run goes on."""
+    run = Run(tmp_path)
+    with hands(run, 2) as (one, foe):
+        name = one.job()
+        for act in ("claim", "renew", "result", "failed"):
+            for payload in GARBAGE:
+                with pytest.raises(EngineError, match="not a"):
+                    foe.session.ask(keys.job(foe.run, act), payload, timeout_s=PATIENCE_S)
+        with pytest.raises(EngineError, match="more than a message may have"):
+            foe.session.ask(keys.job(foe.run, "result"), bytes((15 << 20) + 5000), timeout_s=PATIENCE_S)
+        with pytest.raises(EngineError, match="ask for exactly"):
+            foe.session.ask("cosim/*/jobs/claim", b"", timeout_s=PATIENCE_S)
+        with pytest.raises(TimeoutError):
+            foe.session.ask(keys.job("another-run", "claim"), b"", timeout_s=0.2)
+        reply = foe.claim(versions=versions() | {"libsumo": "0.1"})
+        assert isinstance(reply, TurnedAway) and "libsumo 0.1 in place of" in reply.why
+        reply = foe.claim(metric_schema=METRIC_SCHEMA + 1)
+        assert isinstance(reply, TurnedAway) and f"metric schema {METRIC_SCHEMA + 1} in place of" in reply.why
+        with pytest.raises(EngineError, match="damaged on its way"):
+            foe.say("result", msgspec.structs.replace(one.result(), log=b"gol"))
+        scenario = SUITE.scenarios[0]
+        strange = begun(scenario, DRIVER.manifest, "another suite", DRIVER.source_hash, SPEC.seed)
+        reply = foe.deliver(of=name, record=strange)
+        assert isinstance(reply, TurnedAway) and "another run" in reply.why
+        unknown = msgspec.structs.replace(one.result(), scenario="../../../etc", lease=77)
+        assert foe.say("result", unknown) == Received("refused")
+        foe.lease, foe.scenario = 5, name
+        assert foe.renew() == LetGo() and foe.fail() == Received()
+        assert one.status().odd > 20 and one.status().finished == 0
+        assert one.renew() == GoOn() and one.deliver() == Received("kept")
+        one.job()
+        assert one.deliver() == Received("kept")
+        assert len(run.over()) == 2
+
+
+def test_a_result_that_cannot_be_written_is_not_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A full disk ends the run with its message; begun anew it takes the same result."""
+
+    def full(self: RunFolder, record: Record, log: bytes = b"") -> None:
+        raise MachineError("cannot be written: no space left on device")
+
+    run = Run(tmp_path)
+    with hands(run, 1) as (one,):
+        one.job()
+        with monkeypatch.context() as patch:
+            patch.setattr(RunFolder, "keep", full)
+            with pytest.raises(TimeoutError):
+                one.session.ask(keys.job(one.run, "result"), encode(one.result()), timeout_s=0.5)
+            assert run.over() == {} and "no space left" in str(run.error)
+        run = Run(tmp_path, resumed=True)
+        assert one.deliver() == Received("kept")
+        one.job()
+        assert one.deliver() == Received("kept")
+        assert len(run.over()) == 2
+
+
+def test_a_policy_that_does_not_answer_is_told_by_its_worker(tmp_path: Path) -> None:
+    """What it is asked, and for how long, counts as its worker tells it; between two of its messages nothing ages."""
+    run = Run(tmp_path)
+    with hands(run, 1) as (one,):
+        silent = one.job()
+        assert one.renew(Asks("act", 64, 59.99)) == GoOn()
+        time.sleep(0.05)
+        assert one.renew() == GoOn()
+        one.renew(Asks("act", 64, 60.5))
+        until(lambda: one.status().finished == 1)
+        one.job()
+        assert one.deliver() == Received("kept")
+        records = run.over()
+    assert records[silent].status == "crashed"
+    assert "policy 'stop' gave no answer for 60 s in act at 3.20 s" in records[silent].reason
