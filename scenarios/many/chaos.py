@@ -33,8 +33,8 @@ from cosim.spec.scenario import Suite, write_suite
 from scenarios.checks import small_scenario
 from scenarios.many.roll import CONFLICT, LOG_FILE
 
-Fault = Literal["kill worker", "kill process", "stop worker", "end worker", "kill coordinator"]
-FAULTS: Final[Sequence[Fault]] = ("kill worker", "kill worker", "stop worker", "end worker", "kill coordinator")
+Blow = Literal["kill worker", "kill process", "stop worker", "end worker", "kill coordinator"]
+_BLOWS: Final[Sequence[Blow]] = ("kill worker", "kill worker", "stop worker", "end worker", "kill coordinator")
 _POISON: Final = "COSIM_CHAOS_POISON"
 _SEED: Final = 7
 _LIMIT_S: Final = 2.0
@@ -56,14 +56,14 @@ class Poisoned:
         return Command(0.8, 0.0)
 
 
-class Planned(NamedTuple):
+class PlannedBlow(NamedTuple):
     """A fault, and how many episodes are finished when it happens."""
 
     finished: int
-    fault: Fault
+    fault: Blow
 
 
-class Outcome(NamedTuple):
+class UnderFire(NamedTuple):
     """What came out: episodes, faults that happened, seconds, and what was wrong, in words."""
 
     episodes: int
@@ -72,12 +72,12 @@ class Outcome(NamedTuple):
     wrong: list[str]
 
 
-def plan(episodes: int, seed: int) -> list[Planned]:
+def planned_blows(episodes: int, seed: int) -> list[PlannedBlow]:
     """Random faults, one for about ten episodes, and two of environment processes."""
     draw = random.Random(seed)
-    faults: list[Fault] = [draw.choice(FAULTS) for _ in range(max(episodes // 10, 4))]
-    planned = [Planned(draw.randrange(1, max(int(0.95 * episodes), 2)), fault) for fault in faults]
-    apart = [Planned(share * episodes // 3, "kill process") for share in (1, 2)]
+    faults: list[Blow] = [draw.choice(_BLOWS) for _ in range(max(episodes // 10, 4))]
+    planned = [PlannedBlow(draw.randrange(1, max(int(0.95 * episodes), 2)), fault) for fault in faults]
+    apart = [PlannedBlow(share * episodes // 3, "kill process") for share in (1, 2)]
     return sorted([*planned, *apart])
 
 
@@ -101,8 +101,8 @@ def quiet(folder: Path, episodes: int, jobs: int) -> Path:
 
 
 def chaos(
-    folder: Path, name: str, workers: int, planned: Sequence[Planned], seed: int, *, replaced: bool = True
-) -> Outcome:
+    folder: Path, name: str, workers: int, planned: Sequence[PlannedBlow], seed: int, *, replaced: bool = True
+) -> UnderFire:
     """Run the suite in `folder` again, by `workers` workers and with faults, into the run folder `name` there.
 
     replaced: who is gone is replaced by another worker."""
@@ -112,7 +112,7 @@ def chaos(
         while (code := crew.coordinator.poll()) is None or code not in (0, 1):
             if code is not None:
                 said = (folder / f"{name}.log").read_text(errors="replace")[-1000:]
-                return Outcome(0, happened, time.monotonic() - began_s, [f"coordinator: exit code {code}: {said}"])
+                return UnderFire(0, happened, time.monotonic() - began_s, [f"coordinator: exit code {code}: {said}"])
             crew.tend()
             finished = len(list(run.glob("episodes/*/record.json")))
             if left and finished >= left[0].finished:
@@ -121,7 +121,7 @@ def chaos(
                     happened[left.pop(0).fault] += 1
             time.sleep(_POLL_S)
     wrong = _wrong(folder / "quiet", run)
-    return Outcome(len(read_records(run)), happened, time.monotonic() - began_s, wrong)
+    return UnderFire(len(read_records(run)), happened, time.monotonic() - began_s, wrong)
 
 
 class _Crew:
@@ -143,7 +143,7 @@ class _Crew:
         there = [one for one in self.workers if one.poll() is None]
         self.workers = there + [self._work() for _ in self.workers[len(there) :] if self._replaced]
 
-    def suffer(self, fault: Fault, draw: random.Random) -> bool:
+    def suffer(self, fault: Blow, draw: random.Random) -> bool:
         """Let something happen to somebody. Returns whether it could."""
         one = draw.choice(self.workers)
         if fault == "kill worker":
@@ -249,7 +249,7 @@ def _main() -> int:
     print(f"quiet run: {time.monotonic() - began_s:.0f} s", flush=True)
     wrong = 0
     for seed in range(given.first, given.first + given.seeds):
-        found = chaos(folder, f"chaos-{seed}", given.workers, plan(given.episodes, seed), seed)
+        found = chaos(folder, f"chaos-{seed}", given.workers, planned_blows(given.episodes, seed), seed)
         wrong += bool(found.wrong)
         faults = ", ".join(f"{count} x {fault}" for fault, count in sorted(found.faults.items()))
         ends = "; ".join(found.wrong) or "as in the quiet run to the byte"

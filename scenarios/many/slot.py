@@ -30,7 +30,9 @@ from scenarios.execution.process import WORKER, KeptProcess
 from scenarios.many.words import (
     MOST_SENT_BYTES,
     Asks,
+    Briefing,
     Claim,
+    CoordinatorSays,
     GoOn,
     How,
     Installed,
@@ -40,10 +42,8 @@ from scenarios.many.words import (
     Over,
     Received,
     Renewal,
-    Reply,
     Result,
     TurnedAway,
-    Welcome,
     digest_of,
 )
 
@@ -77,7 +77,7 @@ class WorkSlot:
         self._worker, self._number, self._host, self._installed = worker, number, host, installed
         self._log = logs / f"{number}.log"
         self._read = 0
-        self._welcome: Welcome | None = None
+        self._welcome: Briefing | None = None
         self._process: KeptProcess | None = None
         self._ready = self._ran = self._silent = self._leaving = False
         self._starts, self._heard_s = 0, 0.0
@@ -114,7 +114,7 @@ class WorkSlot:
             found.append(Wish("renew", encode(self._renewal()), 5.0))
         return found
 
-    def replied(self, act: str, reply: Reply | None) -> None:
+    def replied(self, act: str, reply: CoordinatorSays | None) -> None:
         """The reply to a wish, None where there was none. Raises RunEnded, or UsageError when there is nothing to be
         done here."""
         if act == "renew":
@@ -128,7 +128,7 @@ class WorkSlot:
             return
         self._pause_s, self._wish = _FIRST_PAUSE_S, None
         match reply:
-            case Welcome():
+            case Briefing():
                 self._welcome = reply
             case Lease():
                 self._begin(reply)
@@ -184,7 +184,7 @@ class WorkSlot:
             return Wish("claim", encode(claim), 10.0)
         return None
 
-    def _start(self, welcome: Welcome) -> None:
+    def _start(self, welcome: Briefing) -> None:
         self._process = KeptProcess(self._log, WORKER, "environment")
         self._process.send(encode_message(welcome.hello))
         self._ready = self._ran = False
@@ -229,7 +229,7 @@ class WorkSlot:
             asks=_asks(self._process), said=tuple(self._said[: self._underway]),
         )  # fmt: skip
 
-    def _renewed(self, reply: Reply | None) -> None:
+    def _renewed(self, reply: CoordinatorSays | None) -> None:
         if isinstance(reply, GoOn):
             del self._said[: self._underway]
             if self._said or self._done is not None:

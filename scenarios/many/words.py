@@ -15,7 +15,7 @@ from cosim.core.errors import EngineError
 from cosim.core.versions import versions
 from cosim.episode.driver import PolicyCall
 from cosim.records.record import METRIC_SCHEMA, Status
-from cosim.records.run_folder import RunSpec
+from cosim.records.run_spec import RunSpec
 from scenarios.execution.asked import Patience, Question
 from scenarios.execution.messages import Compares, FrameDrawn, Hello, Job, Progress, Waits
 
@@ -116,7 +116,7 @@ class NoResult(Asking, frozen=True, kw_only=True):
     printed: _Printed = b""
 
 
-class Welcome(msgspec.Struct, frozen=True, tag=True):
+class Briefing(msgspec.Struct, frozen=True, tag=True):
     """What a worker needs before it can be given jobs."""
 
     hello: Hello
@@ -173,7 +173,7 @@ class NetAsked(msgspec.Struct, frozen=True):
     begin: _Count = 0
 
 
-Reply = Welcome | Lease | NothingNow | GoOn | LetGo | Over | Received | TurnedAway
+CoordinatorSays = Briefing | Lease | NothingNow | GoOn | LetGo | Over | Received | TurnedAway
 
 
 def digest_of(record: bytes, log: bytes) -> str:
@@ -187,14 +187,14 @@ def run_hash(spec: RunSpec) -> str:
 
 
 _encode_reply = msgspec.msgpack.Encoder().encode
-_replies: msgspec.msgpack.Decoder[Reply] = msgspec.msgpack.Decoder(Reply)
+_replies: msgspec.msgpack.Decoder[CoordinatorSays] = msgspec.msgpack.Decoder(CoordinatorSays)
 
 
-def reply_in_bytes(reply: Reply) -> bytes:
+def reply_in_bytes(reply: CoordinatorSays) -> bytes:
     return _encode_reply(reply)
 
 
-def reply_in(payload: bytes) -> Reply:
+def reply_in(payload: bytes) -> CoordinatorSays:
     """Raises EngineError for what is no reply."""
     try:
         return _replies.decode(payload)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Final, NamedTuple
@@ -19,16 +18,18 @@ from bridge import keys
 from bridge.codec import decode
 from bridge.session import Query, Session
 from cosim.core.errors import EngineError
-from cosim.records.run_folder import RunFolder, RunSpec
+from cosim.records.run_folder import RunFolder
+from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Scenario
-from scenarios.execution.asked import Patience, Question
-from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Message, Ready
+from scenarios.execution.asked import Patience
+from scenarios.execution.messages import Done, Hear, Hello
 from scenarios.execution.transport import GoesOn, Late, Reception
+from scenarios.many.leased import LEASE_S, LeasedWorker
 from scenarios.many.roll import Roll
 from scenarios.many.words import (
     MOST_SENT_BYTES,
+    Briefing,
     Claim,
-    GoOn,
     Lease,
     LetGo,
     NoResult,
@@ -36,21 +37,17 @@ from scenarios.many.words import (
     Over,
     Received,
     Renewal,
-    Reply,
     Result,
     TurnedAway,
-    Welcome,
     digest_of,
     installed_here,
     reply_in_bytes,
     run_hash,
 )
 
-LEASE_S: Final = 15.0
-"""A worker that does not renew its lease for so long has lost it, whatever Zenoh says of it."""
 HELD_S: Final = 2.0
 """A claim is answered after so long even when there is nothing to do."""
-GRACE_S: Final = 3.0
+SETTLING_S: Final = 3.0
 """A run that is begun anew gives no jobs for so long: who works on one tells so first."""
 PARTING_S: Final = 3.0
 """How long those who ask are told that the run is over."""
@@ -76,10 +73,10 @@ class RemoteWorkers:
         self._installed = msgspec.structs.replace(installed_here(), versions=spec.versions)
         self._inbox: queue.SimpleQueue[tuple[str, Query] | _Departed] = queue.SimpleQueue()
         self._claims: dict[tuple[str, int], tuple[Query, float]] = {}
-        self._leased: dict[tuple[str, int], _Remote] = {}
+        self._leased: dict[tuple[str, int], LeasedWorker] = {}
         self._unasked: list[GoesOn | Late] = []
         self._number = secrets.randbits(48)
-        self._opens_at = time.monotonic() + (GRACE_S if resumed else 0.0)
+        self._opens_at = time.monotonic() + (SETTLING_S if resumed else 0.0)
         self._over = False
         self._taken: dict[str, Callable[[Query], None]] = {
             "claim": self._claimed,
@@ -99,12 +96,12 @@ class RemoteWorkers:
     def room(self, busy: int) -> int:
         return len(self._claims) if time.monotonic() >= self._opens_at else 0
 
-    def start(self, hello: Hello) -> _Remote:
+    def start(self, hello: Hello) -> LeasedWorker:
         """The worker that has waited longest. Its first job must be given at once."""
         at, (query, _) = next(iter(self._claims.items()))
         del self._claims[at]
         self._number += 1
-        one = self._leased[at] = _Remote(self, at, self._number, query)
+        one = self._leased[at] = LeasedWorker(self, at, self._number, query)
         return one
 
     def unasked(self) -> Iterable[GoesOn | Late]:
@@ -140,16 +137,16 @@ class RemoteWorkers:
     def _taken_in(self, act: str) -> Callable[[Query], None]:
         return lambda query: self._inbox.put((act, query))
 
-    def forget(self, one: _Remote) -> None:
+    def forget(self, one: LeasedWorker) -> None:
         """The lease of a worker has ended."""
         if self._leased.get(one.at) is one:
             del self._leased[one.at]
 
-    def given(self, one: _Remote) -> None:
+    def given(self, one: LeasedWorker) -> None:
         """A worker has been given a job."""
         self._roll.leased(*one.at, one.scenario)
 
-    def ended_late(self, one: _Remote) -> None:
+    def ended_late(self, one: LeasedWorker) -> None:
         """A worker did not renew its lease."""
         self._roll.note(f"{one.name} has not renewed its lease of {one.scenario} for {LEASE_S:g} s")
 
@@ -192,7 +189,7 @@ class RemoteWorkers:
             return
         self._roll.heard(claim.worker, claim.host, claim.slot)
         if not claim.ready:
-            query.answer(reply_in_bytes(Welcome(self._hello, self._installed, self._patience)))
+            query.answer(reply_in_bytes(Briefing(self._hello, self._installed, self._patience)))
             return
         one = self._leased.get(at)
         if one is not None and one.job is not None and not one.ended:  # the answer to its last claim was lost
@@ -213,7 +210,7 @@ class RemoteWorkers:
             if self._over or one is not None:
                 query.answer(reply_in_bytes(LetGo()))
                 return
-            one = self._leased[at] = _Remote(self, at, renewal.lease, None, renewal.scenario)
+            one = self._leased[at] = LeasedWorker(self, at, renewal.lease, None, renewal.scenario)
             self._unasked.append(GoesOn(renewal.scenario, one))
         one.renew(renewal, query)
 
@@ -292,98 +289,8 @@ class _Told(msgspec.Struct):
     ended: str | None = None
 
 
-class _Remote:
-    """A worker as long as it has one lease (`scenarios.execution.transport.Worker`)."""
-
-    away = in_engine = False
-
-    def __init__(
-        self, workers: RemoteWorkers, at: tuple[str, int], number: int, claim: Query | None, scenario: str = ""
-    ) -> None:
-        self.at, self.number, self.scenario = at, number, scenario
-        self.name = f"{at[0]}/{at[1]}"
-        self.log = f"logs/{at[0]}-{at[1]}.log"
-        self.job: Job | None = None
-        self._workers, self._claim = workers, claim
-        self._said: deque[tuple[Message | None, Query | None, Reply]] = deque([(Ready(), None, GoOn())])
-        self._heard_s, self._held = time.monotonic(), False
-        self._asks: Renewal | NoResult | None = None
-        self._why: str | None = None
-
-    @property
-    def question(self) -> Question | None:
-        """As old as it was when the worker last told of it: what came after that is not known here."""
-        if self._asks is None or self._asks.asks is None:
-            return None
-        return self._asks.asks.question(time.monotonic())
-
-    @property
-    def ended(self) -> bool:
-        """Whether there is nothing to be expected of this lease any more."""
-        return self._why is not None
-
-    def give(self, job: Job) -> None:
-        self.job, self.scenario = job, job.scenario.id
-        if self._claim is not None:
-            self._claim.answer(reply_in_bytes(Lease(self.number, job)))
-            self._workers.given(self)
-
-    def renew(self, renewal: Renewal, query: Query) -> None:
-        """It is alive. It is told so once its frames are written, and once the run knows of it."""
-        self._heard_s, self._asks = time.monotonic(), renewal
-        self._said.extend((message, None, GoOn()) for message in renewal.said if message.scenario == self.scenario)
-        if self._held and not any(isinstance(message, FrameDrawn) for message in renewal.said):
-            query.answer(reply_in_bytes(GoOn()))
-        else:
-            self._said.append((None, query, GoOn()))
-
-    def deliver(self, done: Done, query: Query) -> None:
-        self._heard_s = time.monotonic()
-        self._said.append((done, query, Received()))
-
-    def fail(self, failure: NoResult) -> None:
-        """Its process has ended, or it leaves."""
-        self._asks, self.in_engine = failure, failure.in_engine
-        self.away = failure.how != "ended"
-        self._why = "" if self.away else failure.why
-
-    def lose(self, why: str) -> None:
-        if self._why is None:
-            self._why, self.away, self._asks = why, True, None
-
-    def listen(self, hear: Hear) -> bool:
-        self._held = True
-        while self._said:
-            message, query, reply = self._said.popleft()
-            if message is not None:
-                hear(message)
-            if query is not None:
-                query.answer(reply_in_bytes(reply))
-            if isinstance(message, Done):
-                self._why = ""
-        if self._why is None and time.monotonic() - self._heard_s > LEASE_S:
-            self._workers.ended_late(self)
-            self.lose(f"worker {self.at[0]} fell silent")
-        return self._why is None
-
-    def hang_up(self) -> None:
-        """It has one job, and ends with it."""
-
-    def kill(self, *, wait: bool = True) -> None:
-        """Its lease is over: when it renews it next it is told so."""
-        self._workers.forget(self)
-        for message, query, _ in self._said:
-            if query is not None and wait and not isinstance(message, Done):  # a result is sent again
-                query.answer(reply_in_bytes(LetGo()))
-        self._said.clear()
-
-    def end(self) -> str:
-        self._workers.forget(self)
-        return self._why or ""
-
-
 @contextmanager
-def joined(
+def workers_of_run(
     session: Session,
     held: RunFolder,
     todo: Sequence[Scenario],

@@ -7,14 +7,14 @@ from pathlib import Path
 import pytest
 
 from cosim.records.run_folder import read_records
-from scenarios.many.chaos import Planned, chaos, quiet
+from scenarios.many.chaos import PlannedBlow, chaos, quiet
 
 PLAN = [
-    Planned(1, "kill worker"),
-    Planned(3, "stop worker"),
-    Planned(4, "kill process"),
-    Planned(5, "kill coordinator"),
-    Planned(7, "end worker"),
+    PlannedBlow(1, "kill worker"),
+    PlannedBlow(3, "stop worker"),
+    PlannedBlow(4, "kill process"),
+    PlannedBlow(5, "kill coordinator"),
+    PlannedBlow(7, "end worker"),
 ]
 
 

@@ -20,7 +20,8 @@ from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.policies.load import load_policy
 from cosim.records.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
-from cosim.records.run_folder import RunFolder, RunSpec, read_records
+from cosim.records.run_folder import RunFolder, read_records
+from cosim.records.run_spec import RunSpec
 from cosim.spec.connection import Connection
 from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.execution.asked import Patience
@@ -30,7 +31,9 @@ from scenarios.many import workers as remote
 from scenarios.many.roll import RunStatus
 from scenarios.many.words import (
     Asks,
+    Briefing,
     Claim,
+    CoordinatorSays,
     GoOn,
     Lease,
     LetGo,
@@ -38,16 +41,14 @@ from scenarios.many.words import (
     NothingNow,
     Received,
     Renewal,
-    Reply,
     Result,
     TurnedAway,
-    Welcome,
     digest_of,
     installed_here,
     reply_in,
     run_hash,
 )
-from scenarios.many.workers import joined
+from scenarios.many.workers import workers_of_run
 from tests.conftest import PATIENCE_S
 
 pytestmark = pytest.mark.engine
@@ -108,7 +109,7 @@ class Run:
             done = held.finished()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
-                with joined(
+                with workers_of_run(
                     hub, held, todo, SUITE.scenarios, hello, Patience(), lambda _: None, resumed=self._resumed
                 ) as (transport, tell):
                     self.kill = _killer(transport)
@@ -144,10 +145,10 @@ class Hand:
         self.session.stand(keys.worker(self.run, self.name))
         self.lease, self.scenario = 0, ""
 
-    def say(self, act: str, message: msgspec.Struct) -> Reply:
+    def say(self, act: str, message: msgspec.Struct) -> CoordinatorSays:
         return reply_in(self.session.ask(keys.job(self.run, act), encode(message), timeout_s=PATIENCE_S))
 
-    def claim(self, *, ready: bool = True, **other: object) -> Reply:
+    def claim(self, *, ready: bool = True, **other: object) -> CoordinatorSays:
         installed = msgspec.structs.replace(installed_here(), **other)
         return self.say("claim", Claim(**self.me(), host="here", installed=installed, ready=ready))
 
@@ -158,7 +159,7 @@ class Hand:
         self.lease, self.scenario = reply.number, reply.job.scenario.id
         return self.scenario
 
-    def renew(self, asks: Asks | None = None) -> Reply:
+    def renew(self, asks: Asks | None = None) -> CoordinatorSays:
         said = (Progress(self.scenario, 1.0, 4.5, 0),)
         return self.say("renew", Renewal(**self.me(), lease=self.lease, scenario=self.scenario, asks=asks, said=said))
 
@@ -175,10 +176,10 @@ class Hand:
             digest=digest_of(data, b"log"),
         )  # fmt: skip
 
-    def deliver(self, **named: object) -> Reply:
+    def deliver(self, **named: object) -> CoordinatorSays:
         return self.say("result", self.result(**named))
 
-    def fail(self, how: str = "ended", why: str = "its process was killed by SIGKILL") -> Reply:
+    def fail(self, how: str = "ended", why: str = "its process was killed by SIGKILL") -> CoordinatorSays:
         failure = NoResult(**self.me(), lease=self.lease, scenario=self.scenario, how=how, why=why)
         return self.say("failed", failure)
 
@@ -212,7 +213,7 @@ def test_jobs_are_claimed_renewed_and_delivered_once(tmp_path: Path) -> None:
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         welcome = one.claim(ready=False)
-        assert isinstance(welcome, Welcome) and welcome.hello.policy == "stop"
+        assert isinstance(welcome, Briefing) and welcome.hello.policy == "stop"
         first = one.job()
         assert one.job() == first and one.renew() == GoOn()
         assert other.job() != first
@@ -264,7 +265,7 @@ def test_a_coordinator_begun_anew_takes_what_its_workers_go_on_with(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Neither who works nor who is done with its job loses anything when the coordinator is killed."""
-    monkeypatch.setattr(remote, "GRACE_S", PATIENCE_S)  # nothing can be given before both have told
+    monkeypatch.setattr(remote, "SETTLING_S", PATIENCE_S)  # nothing can be given before both have told
     run = Run(tmp_path)
     with hands(run, 2) as (one, other):
         names = {one.job(), other.job()}

@@ -34,6 +34,7 @@ _OF_ONE_MACHINE = (
 
 
 @coordinator_app.command(
+    "coordinator",
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim coordinator reactive --policy orca --out runs/mine`, and on the same machine "
     "`cosim worker --jobs 2`  \n"
@@ -41,7 +42,7 @@ _OF_ONE_MACHINE = (
     "`cosim coordinator reactive --policy my_robot.policy:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
 )
 @taking(carry_out, without=_OF_ONE_MACHINE)
-def coordinator(
+def coordinator_command(
     listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where workers find it.")] = DEFAULT,
     tls: Tls = "",
     insecure: Insecure = False,
@@ -53,7 +54,7 @@ def coordinator(
     goes on where it was, and so do they. `cosim status` tells how it goes.
     """
     from bridge.session import open_session
-    from scenarios.many.workers import joined
+    from scenarios.many.workers import workers_of_run
 
     connection = listening("coordinator", "--listen", listen, tls, insecure)
 
@@ -65,7 +66,7 @@ def coordinator(
         resumed = bool(asked["resume"])
         with (
             open_session(connection, warned) as session,
-            joined(session, held, todo, picked, hello, patience, tell, resumed=resumed) as workers,
+            workers_of_run(session, held, todo, picked, hello, patience, tell, resumed=resumed) as workers,
         ):
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
             yield workers
@@ -74,12 +75,13 @@ def coordinator(
 
 
 @coordinator_app.command(
+    "worker",
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim worker --jobs 2`  \n`cosim worker --connect tls/hub.lan:7447 --tls certs/worker --jobs "
     "16 --once`  \nExit codes: 0 told to end by SIGTERM, its episodes handed back, or the run is over (--once); 2 the "
     "run needs another installation, or its policy cannot be loaded here; 3 this machine lacks something; 130 Ctrl-C",
 )
-def worker(
+def worker_command(
     connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where the coordinator listens.")] = DEFAULT,
     jobs: Annotated[int, typer.Option(min=1, max=1024, help="Environment processes.")] = 1,
     once: Annotated[bool, typer.Option("--once", help="End when a run is over; else wait for the next one.")] = False,
