@@ -9,7 +9,8 @@ CosimError                what a user can mend: shown as one message
 ├── PolicyError        1  a policy that raised, or answered with something unusable
 ├── EngineError        3  SUMO, PyBullet or Zenoh failed or was misused
 │   ├── DirectorLost   3  the director of the event pedestrians did not answer
-│   └── RendererLost   3  the shared renderer has ended
+│   ├── RendererLost   3  the shared renderer has ended
+│   └── PolicyServerLost 3  the server of a remote policy has ended, or does not know an episode any more
 └── MachineError       3  a full disk, a folder that cannot be written, a library or program that is missing
 """
 
@@ -103,6 +104,10 @@ class RendererLost(EngineError):
     def __init__(self, number: int, asked: str = "") -> None:
         super().__init__("the shared renderer has ended: its log in logs/ of the run folder says more")
         self.number, self.asked = number, asked
+
+
+class PolicyServerLost(EngineError):
+    """The server of a remote policy is gone, or was begun anew: what it knew of the episode is lost."""
 
 
 class MachineError(CosimError):

@@ -24,6 +24,7 @@ from cosim.core.state import Command, RobotState, Signal, Vehicles
 from cosim.episode.control import command_of
 from cosim.episode.ports import BatchPolicy, Manifest, Observation, Policy, Privileged
 from cosim.spec.goal import own_goal
+from cosim.spec.policy_host import PolicyRuns
 
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
@@ -54,8 +55,11 @@ class Driver:
     """A policy that can be asked. It is a Policy itself, and its answers are commands within the robot's limits.
 
     manifest: what the policy is, read once; later changes of `policy.manifest` mean nothing.
-    source_hash: of the file it is written in, "" where that is unknown (`cosim.policies.load`).
+    source_hash: of the file it is written in, "" where that is unknown (`cosim.policies.load`). runs: where it
+    is asked.
     """
+
+    runs: PolicyRuns = "in-process"
 
     def __init__(
         self,
@@ -72,6 +76,19 @@ class Driver:
         self._begun = ""
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
+
+    @property
+    def policy(self) -> Policy:
+        """What is asked."""
+        return self._policy
+
+    @property
+    def clock(self) -> dict[str, float]:
+        """How long the answers of the last episode took, where that is known: for a record's `clock`."""
+        return {}
+
+    def close(self) -> None:
+        """Nothing more is asked of the policy."""
 
     @property
     def batches(self) -> bool:

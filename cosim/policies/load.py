@@ -97,7 +97,17 @@ def _checked(name: str, policy: Policy) -> Manifest:
         raise UsageError(f"policy '{name}' has no method '{lacking[0]}'; see cosim.episode.ports.Policy")
     try:
         with_goal(manifest, None)
-        manifest = msgspec.convert(msgspec.to_builtins(manifest), Manifest)
+        told = msgspec.to_builtins(manifest)
+    except (UsageError, TypeError, ValueError, OverflowError) as error:
+        raise UsageError(f"policy '{name}': its manifest: {error}") from error
+    return checked_manifest(name, told)
+
+
+def checked_manifest(name: str, told: object) -> Manifest:
+    """A manifest as it was told in another process, or copied. Raises UsageError, saying what is wrong with it."""
+    try:
+        manifest = msgspec.convert(told, Manifest)
+        with_goal(manifest, None)
         Clock.for_rate(manifest.rate_hz)
         wrong = _wrong(manifest)
     except (msgspec.ValidationError, SpecError, UsageError, TypeError, ValueError, OverflowError) as error:

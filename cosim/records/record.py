@@ -27,6 +27,7 @@ from cosim.judge.referee import Failure, Verdict
 from cosim.judge.traffic import OnRoad
 from cosim.spec.injection import Injected
 from cosim.spec.odometry import OdometryKind
+from cosim.spec.policy_host import PolicyRuns
 from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
@@ -69,7 +70,8 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     seed: of the scenario; run_seed: of the run, from which is drawn what the policy was told that it is called:
     episode.
     split, structure: of the scenario; crowd_added: its crowd is not the suite's own (`CrowdSpec.added`).
-    policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`).
+    policy_source: hash of the file that the policy is written in (`cosim.policies.load.source_hash`). policy_runs:
+    where it ran. clock: also how long the answers of one that ran elsewhere took.
     walked_into: contacts with people who walked into the robot where it stood; no failures.
     waypoints: how those that it answers were followed. latency_ms: of its commands, as asked for; in real_time the
     median of those that were measured, and another one the next time: such a record is replayed, not made again.
@@ -101,6 +103,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     policy: str
     policy_version: str
     policy_source: str = ""
+    policy_runs: PolicyRuns = "in-process"
     waypoints: WaypointRule = WaypointRule()
     camera: CameraSpec | None = None
     cameras: dict[str, CameraSpec] = {}
@@ -163,7 +166,7 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
 
 def begun(
     scenario: Scenario, manifest: Manifest, suite_hash: str, policy_source: str = "", run_seed: int = 0,
-    latency_ms: float = 0.0, real_time: bool = False,
+    latency_ms: float = 0.0, real_time: bool = False, policy_runs: PolicyRuns = "in-process",
 ) -> Record:  # fmt: skip
     """The record of an episode about which nothing is known yet but what is run: crashed, until it is done."""
     return Record(
@@ -181,6 +184,7 @@ def begun(
         policy=manifest.name,
         policy_version=manifest.version,
         policy_source=policy_source,
+        policy_runs=policy_runs,
         waypoints=manifest.waypoints,
         camera=manifest.camera,
         cameras=dict(manifest.cameras),

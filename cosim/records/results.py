@@ -15,9 +15,9 @@ from cosim.records.record import Record
 
 KEYS: tuple[str, ...] = (
     "scenario", "status", "ended", "reason", "suite", "suite_hash", "scenario_hash", "seed", "split",
-    "structure", "crowd_added", "run_seed", "episode", "robot", "policy", "policy_version", "camera", "rate_hz",
-    "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "latency_ms", "answer_ms", "real_time",
-    "renderer", "ticks", "state_hash",
+    "structure", "crowd_added", "run_seed", "episode", "robot", "policy", "policy_version", "policy_runs", "camera",
+    "rate_hz", "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "latency_ms", "answer_ms",
+    "real_time", "renderer", "ticks", "state_hash",
 )  # fmt: skip
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95

@@ -12,11 +12,12 @@ from cosim.core.errors import UsageError
 from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
+from cosim.spec.policy_host import PolicyRuns
 
 _T = TypeVar("_T")
 SAME = (
-    "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "scenarios",
-    "versions", "renderer", "counterfactual", "waypoints", "seed",
+    "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "policy_runs",
+    "scenarios", "versions", "renderer", "counterfactual", "waypoints", "seed",
     "camera", "cameras", "rate_hz", "goal_protocol", "odometry", "latency_ms", "real_time", "metric_schema", "shard",
 )  # fmt: skip
 """What makes two runs the same."""
@@ -77,6 +78,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     policy_name: str
     policy_version: str
     policy_source: str = ""
+    policy_runs: PolicyRuns = "in-process"
     waypoints: WaypointRule = WaypointRule()
     camera: CameraSpec | None = None
     cameras: dict[str, CameraSpec] = {}

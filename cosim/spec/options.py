@@ -11,6 +11,7 @@ from cosim.core.errors import UsageError
 from cosim.spec.connection import Connection
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
+from cosim.spec.policy_host import PolicyRuns
 from cosim.spec.pseudonym import check_seed
 
 CameraName = Literal["gl", "bullet", "bullet-egl"]
@@ -42,16 +43,17 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
     (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
     0. robot: which drives (`cosim.spec.robot`), in place of the scenario's own. goal: what the policy is told of where
-    to go (`cosim.spec.goal`), in place of what its manifest says. suite_hash, policy_source: of the suite that the
-    scenario is of and of the file of the policy, for the record. own_camera: the policy may see by a camera that the
-    robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard. camera: what draws
-    pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it is on the air
-    meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual: compare it with
-    its street without the robot. injections: pedestrians that were injected into the episode that this one replays.
-    renderer: what draws for the policy in place of a camera of its own. latency_ms: each command takes effect so much
-    later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`). real_time: in
-    place of that, the time that the policy takes for an answer on this machine is that answer's latency, and it is not
-    asked again before: what comes out is replayed from its record, and not made again from its seed. Raises UsageError.
+    to go (`cosim.spec.goal`), in place of what its manifest says. suite_hash, policy_source, policy_runs: of the suite
+    that the scenario is of, of the file of the policy, and where that runs, for the record. own_camera: the policy may
+    see by a camera that the robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard.
+    camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
+    is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
+    compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
+    one replays. renderer: what draws for the policy in place of a camera of its own. latency_ms: each command takes
+    effect so much later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`).
+    real_time: in place of that, the time that the policy takes for an answer on this machine is that answer's latency,
+    and it is not asked again before: what comes out is replayed from its record, and not made again from its seed.
+    Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
     'bullet'
@@ -62,6 +64,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     goal: GoalProtocol | None = None
     suite_hash: str = ""
     policy_source: str = ""
+    policy_runs: PolicyRuns = "in-process"
     own_camera: bool = False
     camera: CameraChoice = "auto"
     frames_every_s: float = 0.0

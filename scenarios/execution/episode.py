@@ -94,8 +94,8 @@ class Episode:
         run_seed = 0 if options.seed is None else options.seed
         self.id, self.seed = pseudonym_of(run_seed, scenario)
         self.clock = Clock.for_rate(manifest.rate_hz)
-        late = options.latency_ms, options.real_time
-        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source, run_seed, *late)
+        how = options.latency_ms, options.real_time, options.policy_runs
+        self.record: Record = begun(scenario, manifest, options.suite_hash, options.policy_source, run_seed, *how)
         self._watches, self._waiting, self._through, self._kinds = list(watches), waiting, through, kinds
         self._began_s = time.perf_counter()
         self._setup_s = 0.0

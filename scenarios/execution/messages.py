@@ -9,17 +9,19 @@ import msgspec
 from cosim.episode.ports import Manifest
 from cosim.records.record import Status
 from cosim.spec.options import EpisodeOptions, RendererAt
+from cosim.spec.policy_host import PolicyHost
 from cosim.spec.scenario import Scenario
 
 
 class Hello(msgspec.Struct, frozen=True, tag=True):
     """The first message to a worker: which policy it drives with, and what that was for the run. renderer: the run's
-    shared one, where there is one."""
+    shared one, where there is one. host: where the policy is."""
 
     policy: str
     manifest: Manifest
     source_hash: str
     renderer: RendererAt | None = None
+    host: PolicyHost = PolicyHost()
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):

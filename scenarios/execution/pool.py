@@ -298,8 +298,9 @@ class _Pool:
         spec = self._folder.spec
         manifest = with_goal(self._hello.manifest, self._options.goal)
         record = begun(
-            scenario, manifest, spec.suite_hash, self._hello.source_hash, spec.seed, spec.latency_ms, spec.real_time
-        )
+            scenario, manifest, spec.suite_hash, self._hello.source_hash, spec.seed, spec.latency_ms, spec.real_time,
+            spec.policy_runs,
+        )  # fmt: skip
         self._folder.keep(msgspec.structs.replace(record, status=status, reason=reason))
         self._over(scenario, status)
 

@@ -8,7 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from multiprocessing.connection import wait
 from pathlib import Path
 from signal import SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV
@@ -19,7 +19,7 @@ import msgspec
 from cosim.core.errors import unwritable
 from scenarios.execution.asked import Asked, Question
 from scenarios.execution.messages import Hear, Hello, Job, decode_message, encode_message
-from scenarios.execution.wire import Wire
+from scenarios.execution.wire import MOST_WIRED_BYTES, Wire
 
 WORKER: Final = "scenarios.execution.worker:serve_jobs"
 ENDING_S: Final = 10.0
@@ -59,22 +59,25 @@ class LocalProcesses:
 
 
 class KeptProcess:
-    """A shepherd and its worker (`scenarios.execution.shepherd`). serves: the function that is the worker; called: what
+    """A shepherd and its worker (`scenarios.execution.shepherd`). log: where it keeps what is printed, None for this
+    process's standard error; serves: the function that is the worker; called: what
     kind of process that is; also: descriptors that it is given besides. open: it has not ended, as far as the run
-    knows."""
+    knows. most_bytes: of a message from it."""
 
-    def __init__(self, log: Path, serves: str, called: str, also: tuple[int, ...] = ()) -> None:
+    def __init__(
+        self, log: Path | None, serves: str, called: str, also: tuple[int, ...] = (), most_bytes: int = MOST_WIRED_BYTES
+    ) -> None:
         self.log, self.open, self._called = str(log), True, called
         self._asked = Asked.new()
         self._last_asked: Question | None = None
         self.in_engine = self.away = False
         ours, theirs = socket.socketpair()
-        self.wire = Wire(ours)
+        self.wire = Wire(ours, most_bytes)
         given = (theirs.fileno(), self._asked.descriptor, *also)
         path = [str(Path(entry).absolute()) for entry in sys.path]
         code = _CODE.format(path=path, serves=serves, given=given, run=os.getpid())
         try:
-            with log.open("ab") as printed:
+            with nullcontext(2) if log is None else log.open("ab") as printed:
                 self._child = subprocess.Popen(
                     [sys.executable, "-P", "-c", code],
                     stdin=subprocess.DEVNULL,
@@ -84,7 +87,7 @@ class KeptProcess:
                     start_new_session=True,
                 )
         except OSError as error:
-            raise unwritable(log, error) from error
+            raise unwritable(Path(self.log), error) from error
         finally:
             theirs.close()
 

@@ -48,12 +48,13 @@ def run_episode(
     driver = Driver.of(policy)
     beside, trouble = Beside(), ""
     listening = [*watches, beside.watch] if options.counterfactual else watches
-    options = msgspec.structs.replace(options, policy_source=driver.source_hash)
+    options = msgspec.structs.replace(options, policy_source=driver.source_hash, policy_runs=driver.runs)
     episode = Episode(scenario, driver.manifest, options, watches=listening, waiting=waiting)
     try:
         with episode:
             drive(episode, driver)
             record, log = episode.result()
+            record = msgspec.structs.replace(record, clock=record.clock | driver.clock)
             entrances = episode.entrances
     except (RendererLost, MachineError):
         raise

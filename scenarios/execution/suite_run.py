@@ -17,11 +17,11 @@ from cosim.episode.camera_rules import check_camera
 from cosim.episode.driver import Driver
 from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
-from cosim.policies.load import load_policy
 from cosim.records.record import METRIC_SCHEMA, NO_RENDERER
 from cosim.records.run_folder import RunFolder, read_spec
 from cosim.records.run_spec import RunSpec, Shard
 from cosim.spec.options import EpisodeOptions
+from cosim.spec.policy_host import PolicyHost
 from cosim.spec.pseudonym import drawn_seed
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Suite
@@ -35,6 +35,7 @@ from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
 from scenarios.execution.transport import InProcess, Transport
 from scenarios.rendering.shared import SharedRenderer, check_shared
+from scenarios.serving.drivers import known_driver
 
 
 def _untold(message: object) -> None:
@@ -52,6 +53,7 @@ def run(
     out: str | Path | None = None,
     resume: bool = False,
     shared_renderer: bool = False,
+    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
     options: EpisodeOptions = EpisodeOptions(),  # noqa: B008  a frozen value
     tell: Hear = _untold,
 ) -> pd.DataFrame:
@@ -61,9 +63,9 @@ def run(
     one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes that
     survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
     out: the run folder, to be kept and resumed; without one only the table is. shared_renderer: one process draws for
-    all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`). options: without a seed one is drawn
-    anew, or taken from the run that is resumed; it stands in every row (`run_seed`). tell: takes in what workers say of
-    their episodes.
+    all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`). host: where a named policy is asked:
+    `PolicyHost(isolated=True)` gives it a process of its own. options: without a seed one is drawn anew, or taken from
+    the run that is resumed; it stands in every row (`run_seed`). tell: takes in what workers say of their episodes.
 
     Raises UsageError for names and options that do not exist, SpecError for scenarios that do not fit their places,
     RunError for a folder that is of another run, MachineError when engines cannot start. An episode that fails is a row
@@ -72,16 +74,16 @@ def run(
     >>> run("reactive", "straight", scenarios=["obstructing-001"])[["scenario", "success"]].to_dict("records")
     [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
-    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
-    picked = scenarios_chosen(whole, scenarios, episodes, events)
-    check_places(whole, picked)
-    driver = load_policy(policy) if isinstance(policy, str) else Driver.of(policy)
-    if not isinstance(policy, str) and (jobs != 1 or shared_renderer):
-        asked = f"jobs={jobs}" if jobs != 1 else "shared_renderer=True"
+    if not isinstance(policy, str) and (jobs != 1 or shared_renderer or host.isolated):
+        asked = f"jobs={jobs}" if jobs != 1 else "host" if host.isolated else "shared_renderer=True"
         raise UsageError(
             f"{asked} needs a policy by its name, such as 'package.module:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
+    whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
+    picked = scenarios_chosen(whole, scenarios, episodes, events)
+    check_places(whole, picked)
+    driver = known_driver(policy, host) if isinstance(policy, str) else Driver.of(policy)
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
     options = _settled(options, whole, driver, seed_of_run(options.seed, Path(out) if resume and out else None))
     check_alone(options, jobs, shared_renderer)
@@ -97,7 +99,7 @@ def run(
             transport: Transport = LocalProcesses(held.path / "logs", jobs)
         else:
             transport = InProcess(driver)
-        hello = Hello(name, driver.manifest, driver.source_hash)
+        hello = Hello(name, driver.manifest, driver.source_hash, host=host)
         renderer = None
         if shared_renderer and todo:
             renderer = stack.enter_context(SharedRenderer(held.path / "logs", hello, asks=asks))
@@ -127,6 +129,7 @@ def run_spec(
         policy_name=manifest.name,
         policy_version=manifest.version,
         policy_source=driver.source_hash,
+        policy_runs=driver.runs,
         waypoints=manifest.waypoints,
         camera=manifest.camera,
         cameras=dict(manifest.cameras),
@@ -160,14 +163,20 @@ class MeasuredLatency(NamedTuple):
     latency_ms: float
 
 
-def measured_latency(whole: Suite, first: Scenario, policy: str, options: EpisodeOptions) -> MeasuredLatency:
+def measured_latency(
+    whole: Suite,
+    first: Scenario,
+    policy: str,
+    options: EpisodeOptions,
+    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
+) -> MeasuredLatency:
     """The latency that a policy shows on this machine in an episode in real time, in a process of its own. Raises
     UsageError when that does not come to its end."""
     alone = EpisodeOptions(
         seed=options.seed, robot=options.robot, goal=options.goal, own_camera=options.own_camera, camera=options.camera,
         real_time=True,
     )  # fmt: skip
-    row = run(whole, policy, scenarios=[first.id], options=alone).iloc[0]
+    row = run(whole, policy, scenarios=[first.id], options=alone, host=host).iloc[0]
     if not isinstance(row["ended"], str):
         raise UsageError(
             f"the latency of '{policy}' cannot be measured: {first.id} is {row['status']}: {row['reason']}"

@@ -11,18 +11,18 @@ from typing import Final
 _LENGTH: Final = struct.Struct("!I")
 _CHUNK_BYTES: Final = 1 << 16
 """Taken at a time: of more a process asks the kernel for memory each time, which takes longer than most messages."""
-_MOST_BYTES: Final = 1 << 30
+MOST_WIRED_BYTES: Final = 1 << 30
 """A message that says it is longer is none: a policy has written to its process's socket."""
 
 
 class Wire:
-    """One end. Each message has its length before it.
+    """One end. Each message has its length before it, and is refused if that is more than most_bytes.
 
     Nothing here waits for the rest of a message unless it is told to: who sends one may be stopped in the middle of it.
     """
 
-    def __init__(self, end: socket.socket) -> None:
-        self._end, self._held, self._unsent = end, bytearray(), bytearray()
+    def __init__(self, end: socket.socket, most_bytes: int = MOST_WIRED_BYTES) -> None:
+        self._end, self._held, self._unsent, self._most_bytes = end, bytearray(), bytearray(), most_bytes
 
     def fileno(self) -> int:
         return self._end.fileno()
@@ -78,7 +78,7 @@ class Wire:
         if len(self._held) < _LENGTH.size:
             return None
         end = _LENGTH.size + int(_LENGTH.unpack_from(self._held)[0])
-        if end > _MOST_BYTES:
+        if end > self._most_bytes:
             raise EOFError
         if len(self._held) < end:
             return None

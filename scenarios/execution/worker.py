@@ -19,7 +19,6 @@ from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
-from cosim.policies.load import load_policy
 from scenarios.execution.asked import Asked
 from scenarios.execution.messages import (
     Compares,
@@ -40,6 +39,7 @@ from scenarios.execution.messages import (
 )
 from scenarios.execution.wire import Wire
 from scenarios.rendering.link import AskedElsewhere, link_to
+from scenarios.serving.drivers import policy_driver
 
 if TYPE_CHECKING:
     from scenarios.execution.episode import Watch
@@ -71,6 +71,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
             say(Unable(str(lack), blames_policy=False))
             raise
         if trouble:
+            driver.close()
             driver = None  # made anew for the next one
         say(done)
 
@@ -96,7 +97,7 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
 
     again: it was loaded here before; what it has made of its class's manifest since means nothing."""
     try:
-        driver = load_policy(hello.policy, timer)
+        driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
         if driver.source_hash != hello.source_hash:
             raise UsageError(f"policy '{hello.policy}' was edited while the run was going on: begin another run")
         if again:

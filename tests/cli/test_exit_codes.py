@@ -14,7 +14,7 @@ from cosim.core.errors import CosimError
 
 CODES = {
     "UsageError": 2, "SpecError": 2, "MapError": 2, "RunError": 2, "AccessError": 2, "PolicyError": 1, "EngineError": 3,
-    "RendererLost": 3, "DirectorLost": 3, "MachineError": 3,
+    "RendererLost": 3, "PolicyServerLost": 3, "DirectorLost": 3, "MachineError": 3,
 }  # fmt: skip
 
 

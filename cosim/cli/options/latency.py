@@ -13,6 +13,7 @@ from cosim.core.errors import UsageError
 
 if TYPE_CHECKING:
     from cosim.spec.options import EpisodeOptions
+    from cosim.spec.policy_host import PolicyHost
     from cosim.spec.scenario import Scenario, Suite
 
 LATENCY_HELP = (
@@ -33,10 +34,12 @@ def with_latency(
     first: Scenario,
     policy: str,
     rate_hz: float,
+    host: PolicyHost | None = None,
 ) -> EpisodeOptions:
     """Options with the latency that was asked for; measured by driving `first`, or that of the run that is resumed.
-    policy, rate_hz: its name, and how often it acts. Raises UsageError."""
+    policy, rate_hz, host: its name, how often it acts, and where. Raises UsageError."""
     from cosim.records.run_folder import read_spec
+    from cosim.spec.policy_host import PolicyHost
     from scenarios.execution.suite_run import measured_latency
 
     latency_ms = asked_latency_ms(asked, real_time)
@@ -45,7 +48,7 @@ def with_latency(
     if resumed is not None:
         return msgspec.structs.replace(options, latency_ms=read_spec(resumed).latency_ms)
     with doing(f"measuring the latency of {policy} in {first.id}"):
-        answer_ms, latency_ms = measured_latency(whole, first, policy, options)
+        answer_ms, latency_ms = measured_latency(whole, first, policy, options, host or PolicyHost())
     err.print(
         f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an answer took {answer_ms:.3g} "
         "ms (median), and commands take effect at whole ticks of 50 ms.",

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
 from datetime import datetime
 from pathlib import Path
+from secrets import token_hex
 from typing import Annotated, Any, get_args
 
 import msgspec
@@ -38,6 +39,7 @@ Carrier = Callable[..., AbstractContextManager[Any]]
 _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
 )
+_ISOLATED_HELP = "The policy gets a process of its own and sees observations alone: it cannot reach into the simulator."
 _SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
@@ -55,6 +57,7 @@ def carry_out(
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
     split: Annotated[str | None, typer.Option(help="Run only scenarios of val, or of test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    isolated: Annotated[bool, typer.Option("--isolated", help=_ISOLATED_HELP)] = False,
     shared_renderer: Annotated[bool, typer.Option("--shared-renderer", help=_SHARED_HELP)] = False,
     shard: Annotated[str, typer.Option(metavar="I/N", help=_SHARD_HELP)] = "",
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/SUITE-POLICY-TIME.")] = None,
@@ -105,12 +108,12 @@ def carry_out(
     from bridge import keys
     from bridge.session import notices_of, open_session
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
-    from cosim.policies.load import load_policy
     from cosim.records.run_folder import RunFolder
     from cosim.records.run_spec import Shard
     from cosim.spec.goal import goal_called
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
+    from cosim.spec.policy_host import PolicyHost
     from cosim.spec.robot import COURIER, robot_called
     from cosim.spec.scenario import Split
     from scenarios.builders.fits import LOOKING, check_places
@@ -123,6 +126,7 @@ def carry_out(
     from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
     from scenarios.execution.transport import Transport
     from scenarios.rendering.shared import SharedRenderer, check_shared
+    from scenarios.serving.drivers import known_driver
 
     asked_latency_ms(latency, real_time)
     air, away = ends_of_run(live, director, tls, insecure)
@@ -153,7 +157,8 @@ def carry_out(
     if part is not None and latency == "measured":
         raise UsageError("--shard with --latency measured: each would measure another: give milliseconds")
     picked = of_run if part is None else part.share(of_run)
-    loaded = load_policy(policy)
+    host = PolicyHost(isolated=isolated, run=token_hex(8))
+    loaded = known_driver(policy, host)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     asks = shared_renderer and check_shared(loaded, drawn_by)
@@ -182,7 +187,7 @@ def carry_out(
         counterfactual=counterfactual,
     )
     went_on = folder if resume else None
-    options = with_latency(options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz)
+    options = with_latency(options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz, host)
     check_alone(options, jobs, shared_renderer)
     spec = run_spec(whole, of_run, policy, loaded, options, shared_renderer, part)
     with ExitStack() as stack:
@@ -205,7 +210,8 @@ def carry_out(
             words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         board = Board(picked, done, compared=counterfactual)
-        hello, patience = Hello(policy, manifest, loaded.source_hash), Patience(answer_timeout, start_timeout)
+        hello = Hello(policy, manifest, loaded.source_hash, host=host)
+        patience = Patience(answer_timeout, start_timeout)
         renderer = None
         if shared_renderer and todo:
             drawing = SharedRenderer(held.path / "logs", hello, asks=asks, patience=patience)
@@ -252,6 +258,7 @@ def carry_out(
     "`cosim run long-horizon --policy my_robot.policy:Mine --out runs/mine --resume`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
     "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
+    "`cosim run long-horizon --policy my_robot.policy:Mine --isolated`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"

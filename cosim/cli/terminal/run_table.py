@@ -113,15 +113,29 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
 
 
 def print_terms(out: Console, table: pd.DataFrame) -> None:
-    """What the policy saw by and was told of where to go, how its waypoints were followed, the run's seed; and what is
-    not as the robot has it."""
-    named = ["camera", "rate_hz", "goal_protocol", "odometry", "privileged", "waypoints", "run_seed", "nonstandard"]
+    """What the policy saw by and was told of where to go, where it ran, how its waypoints were followed, the run's
+    seed; and what is not as the robot has it."""
+    named = [
+        "camera",
+        "rate_hz",
+        "goal_protocol",
+        "odometry",
+        "privileged",
+        "waypoints",
+        "run_seed",
+        "nonstandard",
+        "policy_runs",
+    ]
     if not {*named} <= set(table.columns):
         return
-    for camera, rate_hz, goal, odometry, knows, waypoints, seed, odd in (
+    for camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
         table[named].drop_duplicates().itertuples(index=False)
     ):
-        told = f"goal {goal}; odometry {odometry}; " + "privileged; " * bool(knows)
+        told = (
+            f"goal {goal}; odometry {odometry}; "
+            + "privileged; " * bool(knows)
+            + f"policy {runs}; " * (runs != "in-process")
+        )
         out.print(f"camera {camera}, at {rate_hz:g} Hz; {told}{waypoints}; seed {seed}", highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)

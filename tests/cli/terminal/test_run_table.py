@@ -177,7 +177,12 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         "camera": "own mount, 64 x 64 px, 75 deg",
     }
     row |= {"goal_protocol": "route_point", "odometry": "gps", "privileged": True}  # type: ignore[dict-item]
-    row |= {"rate_hz": 4.0, "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped", "run_seed": 7}  # type: ignore[dict-item]
+    row |= {
+        "rate_hz": 4.0,
+        "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped",
+        "run_seed": 7,
+        "policy_runs": "in-process",
+    }  # type: ignore[dict-item]
     row = dict.fromkeys(METRICS, 1.0) | {name: 1.0 for name, _ in (*SHOWN, *COUNTS)} | row  # type: ignore[assignment]
     for odd, star in (("a camera of its own", True), ("", False)):
         out, said = terminal()
