@@ -28,6 +28,7 @@ from cosim.cli.runs.counterfactual import counterfactual_app
 from cosim.cli.runs.merge import merge_app
 from cosim.cli.runs.replay import replay_app
 from cosim.cli.runs.run import run_app
+from cosim.cli.runs.status import status_app
 from cosim.cli.suites.catalog import list_app
 from cosim.cli.suites.scenario import scenario_app
 from cosim.cli.suites.suite import suite_app
@@ -47,7 +48,7 @@ app = typer.Typer(
 for commands in (
     *(run_app, list_app, show_app, installation_app),
     *(look_app, film_app, report_app, replay_app, export_app, counterfactual_app),
-    *(live_app, direct_app, merge_app, coordinator_app),
+    *(live_app, direct_app, merge_app, coordinator_app, status_app),
     *(bench_app, score_app, compare_app),
 ):
     app.add_typer(commands)

@@ -56,8 +56,9 @@ def check_places(whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untol
 
 def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[str]:
     """What does not fit of scenarios that take place on one map."""
-    spots = [Point(event.x_m, event.y_m) for scenario in scenarios for event in scenario.events]
-    near = shapely.union_all([*(LineString(scenario.route) for scenario in scenarios), *spots])
+    spots = {(event.x_m, event.y_m) for scenario in scenarios for event in scenario.events}
+    ways = {scenario.route for scenario in scenarios}  # the union of many that are the same takes very long
+    near = shapely.union_all([*map(LineString, sorted(ways)), *map(Point, sorted(spots))])
     try:
         area = WalkableArea(street_map.walkable_near(shapely.buffer(near, _AROUND_M)))
     except MapError:

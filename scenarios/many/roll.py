@@ -12,9 +12,10 @@ from typing import Final, Literal
 
 import msgspec
 
+from cosim.core.errors import EngineError
 from cosim.records.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
-from scenarios.execution.messages import Compares, Done, Hear, Message, Progress
+from scenarios.execution.messages import Compares, Done, Hear, Message, Progress, Waits
 from scenarios.many.words import Asking, NoResult, Renewal, Result
 
 STATUS_FILE: Final = "status.json"
@@ -30,12 +31,16 @@ _MOST_PRINTED: Final = 4 << 20
 State = Literal["working", "idle", "silent", "lost", "left", "turned away"]
 
 
-class Under(msgspec.Struct, frozen=True):
-    """An episode under way. time_s: simulated; share: of its route, 0 to 1."""
+class Under(msgspec.Struct, frozen=True, kw_only=True):
+    """An episode under way. time_s: simulated; share: of its route, 0 to 1; for_s: how long it has been run; still_s:
+    since it came on; waits: what for, "" if for nothing."""
 
     scenario: str
-    time_s: float
-    share: float
+    time_s: float = 0.0
+    share: float = 0.0
+    for_s: float = 0.0
+    still_s: float = 0.0
+    waits: str = ""
 
 
 class WorkerHealth(msgspec.Struct, frozen=True, kw_only=True):
@@ -59,8 +64,8 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     folder: str
     total: int
     finished: int
-    since_s: float
-    at_s: float
+    since_s: float = 0.0
+    at_s: float = 0.0
     per_hour: float | None = None
     left_s: float | None = None
     lost: int = 0
@@ -69,13 +74,27 @@ class RunStatus(msgspec.Struct, frozen=True, kw_only=True):
     conflicts: tuple[str, ...] = ()
 
 
+class _Underway:
+    """An episode that a worker runs."""
+
+    def __init__(self, scenario: str) -> None:
+        self.scenario, self.time_s, self.share, self.waits = scenario, 0.0, 0.0, ""
+        self.begun_s = self.moved_s = time.monotonic()
+
+    def told(self, now_s: float) -> Under:
+        return Under(
+            scenario=self.scenario, time_s=self.time_s, share=self.share, for_s=now_s - self.begun_s,
+            still_s=now_s - self.moved_s, waits=self.waits,
+        )  # fmt: skip
+
+
 class _Known:
     """What is known of a worker."""
 
     def __init__(self, host: str) -> None:
         self.host, self.state, self.why, self.done = host, "idle", "", 0
         self.heard_s = time.monotonic()
-        self.under_way: dict[int, Under] = {}
+        self.under_way: dict[int, _Underway] = {}
 
 
 class Roll:
@@ -109,21 +128,23 @@ class Roll:
     def leased(self, worker: str, slot: int, scenario: str) -> None:
         """A worker has been given a job."""
         one = self._of(worker, "")
-        one.state, one.under_way[slot] = "working", Under(scenario, 0.0, 0.0)
+        one.state, one.under_way[slot] = "working", _Underway(scenario)
 
     def renewed(self, renewal: Renewal) -> None:
         one = self._of(renewal.worker, "")
         one.state, one.why = "working", ""
         under = one.under_way.get(renewal.slot)
         if under is None or under.scenario != renewal.scenario:
-            under = Under(renewal.scenario, 0.0, 0.0)
+            under = one.under_way[renewal.slot] = _Underway(renewal.scenario)
         for message in renewal.said:
+            under.moved_s, under.waits = time.monotonic(), ""
             if isinstance(message, Progress):
                 far = message.route_s_m / self._lengths_m.get(message.scenario, 1.0)
-                under = Under(message.scenario, message.time_s, min(max(far, 0.0), 1.0))
+                under.time_s, under.share = message.time_s, min(max(far, 0.0), 1.0)
             elif isinstance(message, Compares):
-                under = Under(message.scenario, under.time_s, 1.0)
-        one.under_way[renewal.slot] = under
+                under.share, under.waits = 1.0, f"is compared, {message.share:.0%}"
+            elif isinstance(message, Waits):
+                under.waits = message.reason
 
     def delivered(self, result: Result) -> None:
         one = self._of(result.worker, "")
@@ -230,6 +251,14 @@ class Roll:
         return one
 
 
+def status_in(payload: bytes) -> RunStatus:
+    """A status as it was told or kept. Raises EngineError for what is none."""
+    try:
+        return msgspec.json.decode(payload, type=RunStatus)
+    except (msgspec.DecodeError, RecursionError) as error:
+        raise EngineError(f"the status of the run cannot be read: {error}") from error
+
+
 def _health(name: str, one: _Known, now_s: float) -> WorkerHealth:
     silent_s = now_s - one.heard_s
     state: State = one.state  # type: ignore[assignment]
@@ -237,7 +266,7 @@ def _health(name: str, one: _Known, now_s: float) -> WorkerHealth:
         state = "silent"
     return WorkerHealth(
         name=name, host=one.host, state=state, silent_s=silent_s, done=one.done, why=one.why,
-        under_way=tuple(one.under_way.values()),
+        under_way=tuple(under.told(now_s) for under in one.under_way.values()),
     )  # fmt: skip
 
 

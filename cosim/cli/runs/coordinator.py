@@ -4,27 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from signal import SIGINT
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, listening, warned
 from cosim.cli.options.panels import MANY
 from cosim.cli.options.taking import taking
-from cosim.cli.runs.run import carry_out
+from cosim.cli.runs.run import Carried, carry_out
 from cosim.cli.terminal.consoles import err
 from cosim.core.errors import INTERRUPTED
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from cosim.records.run_folder import RunFolder
-    from cosim.spec.scenario import Scenario
-    from scenarios.execution.asked import Patience
-    from scenarios.execution.messages import Hear, Hello
-    from scenarios.execution.transport import Transport
 
 coordinator_app = typer.Typer()
 
@@ -59,19 +51,12 @@ def coordinator_command(
     connection = listening("coordinator", "--listen", listen, tls, insecure)
 
     @contextmanager
-    def carried(
-        held: RunFolder, todo: Sequence[Scenario], picked: Sequence[Scenario], hello: Hello, patience: Patience,
-        tell: Hear,
-    ) -> Iterator[tuple[Transport, Hear]]:  # fmt: skip
-        resumed = bool(asked["resume"])
-        with (
-            open_session(connection, warned) as session,
-            workers_of_run(session, held, todo, picked, hello, patience, tell, resumed=resumed) as workers,
-        ):
+    def carrier() -> Iterator[Carried]:
+        with open_session(connection, warned) as session:
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
-            yield workers
+            yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
 
-    carry_out(**asked, carrier=carried)
+    carry_out(**asked, carrier=carrier())
 
 
 @coordinator_app.command(

@@ -34,7 +34,7 @@ from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
 run_app = typer.Typer()
-Carrier = Callable[..., AbstractContextManager[Any]]
+Carried = Callable[..., AbstractContextManager[Any]]
 
 _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
@@ -101,10 +101,11 @@ def carry_out(
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
-    carrier: Carrier | None = None,
+    carrier: AbstractContextManager[Carried] | None = None,
 ) -> None:
     """Do what is asked by the options of `cosim run`. carrier: what reaches the workers, in place of processes of this
-    machine: (held folder, scenarios to run, those of the run, hello, patience, tell) -> (transport, tell)."""
+    machine, opened before anything is written: (held folder, scenarios to run, those of the run, hello, patience, tell)
+    -> (transport, tell)."""
     from bridge import keys
     from bridge.session import notices_of, open_session
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
@@ -191,6 +192,7 @@ def carry_out(
     check_alone(options, jobs, shared_renderer)
     spec = run_spec(whole, of_run, policy, loaded, options, shared_renderer, part)
     with ExitStack() as stack:
+        carried = None if carrier is None else stack.enter_context(carrier)
         if on_air is not None:
             hub = stack.enter_context(open_session(on_air.connection))
             options = msgspec.structs.replace(options, live=Live(connection=hub.inside, run=named))
@@ -220,11 +222,10 @@ def carry_out(
         try:
             with ExitStack() as running:
                 tell: Hear = board.tell
-                if carrier is None:
+                if carried is None:
                     running.enter_context(remembered(held, todo, jobs))
                 elif todo:
-                    carried = carrier(held, todo, picked, hello, patience, tell)
-                    transport, tell = running.enter_context(carried)
+                    transport, tell = running.enter_context(carried(held, todo, picked, hello, patience, tell))
                 running.enter_context(board.bars)
                 run_all(held, todo, hello, transport, tell=tell, options=options, patience=patience, renderer=renderer)
         except KeyboardInterrupt:
