@@ -25,10 +25,11 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):
-    """Run this."""
+    """Run this. net_hash: that of its place for a run on another machine; "" where it need not be compared."""
 
     scenario: Scenario
     options: EpisodeOptions = EpisodeOptions()
+    net_hash: str = ""
 
 
 class Ready(msgspec.Struct, frozen=True, tag=True):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from functools import lru_cache
 from pathlib import Path
 
+from cosim.core.errors import MachineError, MapError, SpecError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City, Place
 from physics.world.street_surface import StreetSurface
@@ -21,6 +22,19 @@ def place(where: Place) -> tuple[Path, StreetMap]:
     from sumo_nets.maps.mapstore import map_net, read_map  # with the importer of maps
 
     return map_net(where), read_map(where)
+
+
+def check_place(where: Place, net_hash: str) -> None:
+    """Raises MachineError when a place cannot be had on this machine, or its net is another one than the run's."""
+    try:
+        found = place(where)[1].net_hash
+    except (MapError, UsageError, SpecError) as error:
+        raise MachineError(f"the place of an episode of the run cannot be had here: {error}") from error
+    if found != net_hash:
+        raise MachineError(
+            f"{where.name} is another one here: its net's hash is {found}, for the run it is {net_hash}: set "
+            "COSIM_CACHE to a new folder"
+        )
 
 
 @lru_cache(maxsize=1)

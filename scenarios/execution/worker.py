@@ -116,8 +116,11 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
 def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
     printed, because a record holds the message alone."""
+    from scenarios.execution.places import check_place
     from scenarios.execution.run import run_episode
 
+    if job.net_hash:
+        check_place(job.scenario.place, job.net_hash)
     name = job.scenario.id
     try:
         if (shared := job.options.renderer) is not None:

@@ -21,6 +21,9 @@ class Keeper(Protocol):
     def forget(self, one: LeasedWorker) -> None:
         """Its lease has ended."""
 
+    def with_net(self, job: Job) -> Job:
+        """A job, with the hash of its place."""
+
     def given(self, one: LeasedWorker) -> None:
         """It has been given its job."""
 
@@ -59,9 +62,9 @@ class LeasedWorker:
         return self._why is not None
 
     def give(self, job: Job) -> None:
-        self.job, self.scenario = job, job.scenario.id
+        self.job, self.scenario = self._keeper.with_net(job), job.scenario.id
         if self._claim is not None:
-            self._claim.answer(reply_in_bytes(Lease(self.number, job)))
+            self._claim.answer(reply_in_bytes(Lease(self.number, self.job)))
             self._keeper.given(self)
 
     def renew(self, renewal: Renewal, query: Query) -> None:

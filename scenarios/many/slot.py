@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bridge.codec import encode
 from cosim.core.errors import MachineError, UsageError
+from cosim.spec.scenario import CityMap
 from scenarios.execution.asked import Question
 from scenarios.execution.messages import (
     Compares,
@@ -47,6 +48,9 @@ from scenarios.many.words import (
     digest_of,
 )
 
+if TYPE_CHECKING:
+    from scenarios.many.nets import Fetched
+
 RENEW_S: Final = 1.0
 _STARTS: Final = 2
 """So many environment processes in a row may end before they are ready."""
@@ -56,6 +60,10 @@ _AT_ONCE_BYTES: Final = 4 << 20
 _LAST_PRINTED: Final = 60_000
 _MOST_WORDS: Final = 2000
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.1, 1.0
+
+
+NET: Final = "net:"
+"""How what is asked begins when it is for a map, whose hash follows."""
 
 
 class Wish(NamedTuple):
@@ -82,6 +90,7 @@ class WorkSlot:
         self._ready = self._ran = self._silent = self._leaving = False
         self._starts, self._heard_s = 0, 0.0
         self._lease = 0
+        self._fetched: Fetched | None = None
         self._job: Job | None = None
         self._said: list[Progress | Waits | Compares | FrameDrawn] = []
         self._underway = 0
@@ -99,7 +108,7 @@ class WorkSlot:
     @property
     def holds_result(self) -> bool:
         """Whether there is something that the coordinator has not acknowledged."""
-        return self._done is not None or (self._wish is not None and self._wish.act != "claim")
+        return self._done is not None or (self._wish is not None and self._wish.act in ("result", "failed"))
 
     def wishes(self, now_s: float) -> list[Wish]:
         """What is to be asked now. Each is answered by `replied`."""
@@ -114,6 +123,19 @@ class WorkSlot:
             found.append(Wish("renew", encode(self._renewal()), 5.0))
         return found
 
+    def part_came(self, payload: bytes | None, refusal: str) -> None:
+        """A part of a map has come, or nobody has answered. Raises MachineError when it is refused."""
+        self._asked = False
+        if refusal:
+            raise MachineError(f"a map of the run cannot be had: {refusal}")
+        if payload is None and self._fetched is not None:
+            self._later()
+            return
+        self._wish, self._pause_s = None, _FIRST_PAUSE_S
+        if payload is not None and self._fetched is not None and self._fetched.take(payload):
+            self._fetched = None
+            self._give()
+
     def replied(self, act: str, reply: CoordinatorSays | None) -> None:
         """The reply to a wish, None where there was none. Raises RunEnded, or UsageError when there is nothing to be
         done here."""
@@ -123,8 +145,7 @@ class WorkSlot:
             return
         self._asked = False
         if reply is None:
-            self._next_s = time.monotonic() + self._pause_s
-            self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
+            self._later()
             return
         self._pause_s, self._wish = _FIRST_PAUSE_S, None
         match reply:
@@ -165,10 +186,15 @@ class WorkSlot:
     def end(self) -> None:
         """End the process."""
         process, self._process = self._process, None
-        self._ready = False
+        self._ready, self._fetched = False, None
         if process is not None:
             process.kill(wait=False)
             process.end()
+
+    def _later(self) -> None:
+        """What was not answered is asked again after a pause."""
+        self._next_s = time.monotonic() + self._pause_s
+        self._pause_s = min(2 * self._pause_s, _LONGEST_PAUSE_S)
 
     def _wanted(self) -> Wish | None:
         """What is to be asked next when nothing else is."""
@@ -176,6 +202,8 @@ class WorkSlot:
             return self._result(self._done)
         if self._leaving:
             return None
+        if self._fetched is not None:
+            return Wish(f"{NET}{self._fetched.digest}", self._fetched.asks, 10.0)
         if self._welcome is None or (self._ready and self._job is None and self._done is None):
             ready = self._welcome is not None
             claim = Claim(
@@ -189,14 +217,23 @@ class WorkSlot:
         self._process.send(encode_message(welcome.hello))
         self._ready = self._ran = False
         self._heard_s = time.monotonic()
-        if self._job is not None and self._done is None:
-            self._process.give(self._job)
+        self._give()
 
     def _begin(self, lease: Lease) -> None:
         self._lease, self._job, self._silent = lease.number, lease.job, True
         self._renew_s = time.monotonic() + RENEW_S
-        if self._process is not None:
-            self._process.give(lease.job)
+        where = lease.job.scenario.place
+        if isinstance(where, CityMap):
+            from scenarios.many.nets import Fetched, lacks  # with the importer of maps
+
+            if lacks(where):
+                self._fetched = Fetched(where, lease.job.net_hash)
+        self._give()
+
+    def _give(self) -> None:
+        """Its job, to the process, if there are both, and the map that it takes place on."""
+        if self._process is not None and self._job is not None and self._done is None and self._fetched is None:
+            self._process.give(self._job)
 
     def _take(self, message: Message) -> None:
         self._heard_s, self._silent = time.monotonic(), False

@@ -24,7 +24,7 @@ from bridge import keys
 from bridge.session import Session, open_session
 from cosim.core.errors import CosimError, EngineError
 from cosim.spec.connection import Connection
-from scenarios.many.slot import RunEnded, Wish, WorkSlot
+from scenarios.many.slot import NET, RunEnded, Wish, WorkSlot
 from scenarios.many.words import installed_here, reply_in
 
 _RETRY_S: Final = 0.5
@@ -176,7 +176,9 @@ class _Service:
             self._replies.put((slot, wish.act, payload, error))
             self._leaving.ring()
 
-        self._session.send(keys.job(self._run, wish.act), wish.payload, replied, timeout_s=wish.timeout_s)
+        is_net, digest = wish.act.startswith(NET), wish.act.removeprefix(NET)
+        key = keys.net(self._run, digest) if is_net else keys.job(self._run, wish.act)
+        self._session.send(key, wish.payload, replied, timeout_s=wish.timeout_s)
 
     def _take(self, slot: WorkSlot | None, act: str, payload: bytes | None, error: str) -> None:
         if payload is not None:
@@ -187,7 +189,9 @@ class _Service:
         if error and error != self._told:
             self._told = error
             self._say(f"the coordinator refused a '{act}': {error}")
-        if slot is not None:
+        if slot is not None and act.startswith(NET):
+            slot.part_came(payload, error)
+        elif slot is not None:
             slot.replied(act, None if payload is None else reply_in(payload))
 
     def _other_run(self) -> bool:

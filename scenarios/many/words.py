@@ -6,11 +6,14 @@ A worker asks, the coordinator answers. Whatever is asked may be asked again: th
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
+from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import msgspec
 from msgspec import Meta
 
+from cosim.core.baked import sources_hash
 from cosim.core.errors import EngineError
 from cosim.core.versions import versions
 from cosim.episode.driver import PolicyCall
@@ -33,25 +36,34 @@ _Printed = Annotated[bytes, Meta(max_length=1 << 16)]
 
 
 class Installed(msgspec.Struct, frozen=True, kw_only=True):
-    """What makes results: two with the same build come to the same bits."""
+    """What makes results: where all of it is the same they are the same to the bit. source: hash of this project's."""
 
     versions: dict[str, str]
     metric_schema: int
+    source: str
     protocol: int = PROTOCOL
 
     def differs_from(self, run: Installed) -> str:
         """In words, where this is another one than the run's; "" where it is not."""
         here, there = (
-            {**build.versions, "metric schema": str(build.metric_schema), "protocol": str(build.protocol)}
-            for build in (self, run)
+            {
+                **one.versions,
+                "metric schema": str(one.metric_schema),
+                "source": one.source,
+                "protocol": str(one.protocol),
+            }
+            for one in (self, run)
         )
         names = sorted(name for name in here.keys() | there.keys() if here.get(name) != there.get(name))
         return ", ".join(f"{n} {here.get(n, 'missing')} in place of {there.get(n, 'none')}" for n in names)
 
 
+@lru_cache(maxsize=1)
 def installed_here() -> Installed:
-    """That of this installation."""
-    return Installed(versions=versions(), metric_schema=METRIC_SCHEMA)
+    """What is installed here."""
+    rooms = Path(__file__).parents[2]
+    source = sources_hash(*(rooms / name for name in ("cosim", "sumo_nets", "physics", "bridge", "scenarios")))
+    return Installed(versions=versions(), metric_schema=METRIC_SCHEMA, source=source)
 
 
 class Asks(msgspec.Struct, frozen=True):

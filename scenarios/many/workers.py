@@ -22,9 +22,10 @@ from cosim.records.run_folder import RunFolder
 from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Scenario
 from scenarios.execution.asked import Patience
-from scenarios.execution.messages import Done, Hear, Hello
+from scenarios.execution.messages import Done, Hear, Hello, Job
 from scenarios.execution.transport import GoesOn, Late, Reception
 from scenarios.many.leased import LEASE_S, LeasedWorker
+from scenarios.many.nets import Nets
 from scenarios.many.roll import Roll
 from scenarios.many.words import (
     MOST_SENT_BYTES,
@@ -75,6 +76,7 @@ class RemoteWorkers:
         self._claims: dict[tuple[str, int], tuple[Query, float]] = {}
         self._leased: dict[tuple[str, int], LeasedWorker] = {}
         self._unasked: list[GoesOn | Late] = []
+        self._nets = Nets()
         self._number = secrets.randbits(48)
         self._opens_at = time.monotonic() + (SETTLING_S if resumed else 0.0)
         self._over = False
@@ -84,6 +86,7 @@ class RemoteWorkers:
             "result": self._delivered,
             "failed": self._failed,
             "status": self._told,
+            "net": self._handed_out,
         }
 
     def open(self) -> None:
@@ -91,6 +94,7 @@ class RemoteWorkers:
         for act in ("claim", "renew", "result", "failed"):
             self._session.collect(keys.job(self.run, act), self._taken_in(act))
         self._session.collect(keys.status(self.run), self._taken_in("status"), found=True)
+        self._session.collect(keys.net(self.run, "*"), self._taken_in("net"))
         self._session.watch(keys.worker(self.run, "*"), self._seen)
 
     def room(self, busy: int) -> int:
@@ -141,6 +145,9 @@ class RemoteWorkers:
         """The lease of a worker has ended."""
         if self._leased.get(one.at) is one:
             del self._leased[one.at]
+
+    def with_net(self, job: Job) -> Job:
+        return msgspec.structs.replace(job, net_hash=self._nets.hash_of(job.scenario.place))
 
     def given(self, one: LeasedWorker) -> None:
         """A worker has been given a job."""
@@ -273,6 +280,9 @@ class RemoteWorkers:
             one.fail(failure)
         self._roll.failed(failure)
         query.answer(reply_in_bytes(Received()))
+
+    def _handed_out(self, query: Query) -> None:
+        query.answer(self._nets.part(query.key.rpartition("/")[2], query.payload))
 
     def _told(self, query: Query) -> None:
         query.answer(msgspec.json.encode(self._roll.status()))

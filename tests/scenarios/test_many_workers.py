@@ -23,11 +23,12 @@ from cosim.records.record import METRIC_SCHEMA, NO_RENDERER, Record, begun
 from cosim.records.run_folder import RunFolder, read_records
 from cosim.records.run_spec import RunSpec
 from cosim.spec.connection import Connection
-from cosim.spec.scenario import City, Scenario, Suite
+from cosim.spec.scenario import City, CityMap, Scenario, Suite
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.pool import ATTEMPTS, LOSSES, run_all
 from scenarios.many import workers as remote
+from scenarios.many.nets import Fetched, Nets, lacks
 from scenarios.many.roll import RunStatus
 from scenarios.many.words import (
     Asks,
@@ -49,6 +50,7 @@ from scenarios.many.words import (
     run_hash,
 )
 from scenarios.many.workers import workers_of_run
+from sumo_nets.net.net_hash import hash_of
 from tests.conftest import PATIENCE_S
 
 pytestmark = pytest.mark.engine
@@ -58,7 +60,7 @@ SUITE = Suite(
     name="s", version="1",
     scenarios=tuple(
         Scenario(
-            id=f"s-{i}", suite="s", place=City(seed=0), seed=i, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+            id=f"s-{i}", suite="s", place=City(seed=0, net_hash="h"), seed=i, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
             route=((0.0, 0.0), (9.0, 0.0)),
         )
         for i in range(2)
@@ -374,3 +376,31 @@ def test_a_policy_that_does_not_answer_is_told_by_its_worker(tmp_path: Path) -> 
         records = run.over()
     assert records[silent].status == "crashed"
     assert "policy 'stop' gave no answer for 60 s in act at 3.20 s" in records[silent].reason
+
+
+def test_a_map_reaches_workers_that_lack_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It comes in parts, under its name, and only if its hash is right; what the run has no map of is refused."""
+    there, here = tmp_path / "there", tmp_path / "here"
+    where = CityMap(map="mine", net_hash=hash_of(net := b"<net>" + secrets.token_hex(3 << 20).encode() + b"</net>"))
+    (there / "maps" / "mine").mkdir(parents=True)
+    (there / "maps" / "mine" / "net.xml").write_bytes(net)
+    (there / "maps" / "mine" / "about.json").write_bytes(b"{}")
+
+    def fetched(expected: str) -> None:
+        monkeypatch.setenv("COSIM_CACHE", str(there))
+        nets, parts, last = Nets(), 0, False
+        digest, wanted = nets.hash_of(where), Fetched(where, expected)
+        while not last:
+            monkeypatch.setenv("COSIM_CACHE", str(there))
+            part = nets.part(digest, wanted.asks)
+            monkeypatch.setenv("COSIM_CACHE", str(here))
+            last, parts = wanted.take(part), parts + 1
+        assert parts > 1
+        with pytest.raises(EngineError, match="has no map 'another'"):
+            nets.part("another", wanted.asks)
+
+    with pytest.raises(EngineError, match=f"came with hash {where.net_hash} in place of wrong"):
+        fetched("wrong")
+    assert lacks(where) and not (here / "maps" / "mine").exists()
+    fetched(where.net_hash)
+    assert not lacks(where) and (here / "maps" / "mine" / "net.xml").read_bytes() == net
