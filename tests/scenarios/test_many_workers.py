@@ -27,6 +27,7 @@ from cosim.spec.scenario import City, CityMap, Scenario, Suite
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.pool import ATTEMPTS, LOSSES, run_all
+from scenarios.many import roll
 from scenarios.many import workers as remote
 from scenarios.many.nets import Fetched, Nets, lacks
 from scenarios.many.roll import RunStatus
@@ -51,7 +52,7 @@ from scenarios.many.words import (
 )
 from scenarios.many.workers import workers_of_run
 from sumo_nets.net.net_hash import hash_of
-from tests.conftest import PATIENCE_S
+from tests.conftest import PATIENCE_S, Cosim
 
 pytestmark = pytest.mark.engine
 
@@ -404,3 +405,33 @@ def test_a_map_reaches_workers_that_lack_it(tmp_path: Path, monkeypatch: pytest.
     assert lacks(where) and not (here / "maps" / "mine").exists()
     fetched(where.net_hash)
     assert not lacks(where) and (here / "maps" / "mine" / "net.xml").read_bytes() == net
+
+
+def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
+    cosim: Cosim, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the run folder and by the coordinator's address the same; afterwards what the folder holds; where there is no
+    run, in words."""
+    monkeypatch.setattr(roll, "SILENT_S", 0.0)
+    run = Run(tmp_path)
+    with hands(run, 3) as (lost, one, silent):
+        lost.job()
+        name = one.job()
+        lost.session.close()
+        until(lambda: f"{lost.name}: lost" in run.log)
+        silent.job()
+        until(lambda: (run.folder / "status.json").exists() and silent.name in (run.folder / "status.json").read_text())
+        told = cosim("status", str(run.folder)).stdout
+        assert told.startswith("s, policy stop: 0 of 2 episodes; 1 lost with their workers and run again")
+        lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
+        assert lines[lost.name][1] == "lost" and lines[silent.name][1] == "silent"
+        monkeypatch.setattr(roll, "SILENT_S", PATIENCE_S)
+        assert one.renew() == GoOn()
+        told = cosim("status", "--connect", run.endpoint).stdout
+        lines = {line.split()[0]: line.split() for line in told.splitlines() if line.strip()}
+        assert lines[one.name][1] == "working" and lines[one.name][4:] == [name, "at", "1", "s,", "50%"]
+        assert one.deliver() == Received("kept") and silent.deliver() == Received("kept")
+        run.over()
+    assert cosim("status", str(run.folder)).stdout == "s, policy stop: 2 of 2 episodes\n"
+    assert (said := cosim("status", "--connect", run.endpoint)).returncode == 3 and "no hub answers" in said.stderr
+    assert (said := cosim("status")).returncode == 2 and "name a run folder" in said.stderr
