@@ -14,7 +14,7 @@ import typer
 from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, listening, warned
 from cosim.cli.options.panels import MANY
 from cosim.cli.options.taking import taking
-from cosim.cli.runs.run import Carried, carry_out
+from cosim.cli.runs.run import ReachesWorkers, carry_out
 from cosim.cli.terminal.consoles import err
 from cosim.core.errors import INTERRUPTED
 
@@ -51,7 +51,7 @@ def coordinator_command(
     connection = listening("coordinator", "--listen", listen, tls, insecure)
 
     @contextmanager
-    def carrier() -> Iterator[Carried]:
+    def carrier() -> Iterator[ReachesWorkers]:
         with open_session(connection, warned) as session:
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
             yield partial(workers_of_run, session, resumed=bool(asked["resume"]))

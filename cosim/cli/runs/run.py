@@ -34,7 +34,7 @@ from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
 run_app = typer.Typer()
-Carried = Callable[..., AbstractContextManager[Any]]
+ReachesWorkers = Callable[..., AbstractContextManager[Any]]
 
 _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
@@ -101,7 +101,7 @@ def carry_out(
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
-    carrier: AbstractContextManager[Carried] | None = None,
+    carrier: AbstractContextManager[ReachesWorkers] | None = None,
 ) -> None:
     """Do what is asked by the options of `cosim run`. carrier: what reaches the workers, in place of processes of this
     machine, opened before anything is written: (held folder, scenarios to run, those of the run, hello, patience, tell)
