@@ -22,6 +22,7 @@ TICK_S = 0.05
 HALF_M = (0.35, 0.275)
 PEOPLE = {"conversing": (2, 3, 4), "queueing": (2, 3, 5), "ped_crossing": (1, 2, 3, 4)}
 HALF_WIDTHS_M = {"queueing": {2: 1.4, 3: 1.6, 5: 2.9}}
+NEAR_M = 2.0
 STANDING = ("obstructing", "conversing", "queueing", "gesturing")
 
 
@@ -48,7 +49,8 @@ def drive(
     one: Event, speed_at: Callable[[float], float], start_m: float, seconds: float, left_m: float = 0.0
 ) -> Driven:
     """A robot on a line beside the x axis whose speed (m/s) is a function of the time (s), until it has touched
-    somebody."""
+    somebody, or gone between the two of a conversation. Gaps are looked at where it is within 2 m of somebody along its
+    way, between whom it goes where it is beside them: elsewhere neither can be."""
     states: tuple[EventState, ...] = ()
     x_m, v_mps, nearest_m, between = start_m, speed_at(0.0), math.inf, False
     seen = []
@@ -62,12 +64,15 @@ def drive(
         before_m, v_mps = x_m, speed_at(tick * TICK_S)
         x_m += v_mps * TICK_S
         seen.append((x_m, states[0]))
-        walkers = states[0].walkers
-        at = np.array([(walker.x_m, walker.y_m) for walker in walkers])
+        ahead_m = [walker.x_m - x_m for walker in states[0].walkers]
+        if max(ahead_m) < -NEAR_M or min(ahead_m) > NEAR_M:
+            continue
+        at = np.array([(walker.x_m, walker.y_m) for walker in states[0].walkers])
         gaps = box_disk_gap(np.array([Pose(x_m, left_m, 0.0)]), *HALF_M, at[None])[0] - 0.3
         nearest_m = min(nearest_m, float(gaps.min()))
-        between |= went_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
-        if nearest_m < 0.0:
+        if len(at) > 1 and min(ahead_m) <= 0.0 and max(ahead_m) >= before_m - x_m:
+            between |= went_between(np.array([before_m, left_m]), np.array([x_m, left_m]), at)
+        if nearest_m < 0.0 or (between and one.kind == "conversing" and len(at) == 2):
             break
     return Driven(nearest_m, between, states[0], seen)
 
@@ -82,7 +87,8 @@ def test_who_drives_straight_on_at_whatever_speed_meets_somebody_of_every_event(
             half_width_m = HALF_WIDTHS_M.get(kind, {}).get(people, half_m)
             for side, speed_mps in ((1, 1.1), (-1, 1.65)):
                 one = event(kind, half_width_m, people, side, speed_mps)
-                start_m, way_m = (48.0, 18.0) if kind == "overtaking" else (28.0, 36.0)
+                before_m = 2.0 if kind == "overtaking" else 1.0 + (EVENT_KINDS[kind].trigger_m or one.half_length_m)
+                start_m, way_m = 50.0 - before_m, before_m + (16.0 if kind == "overtaking" else 14.0)
                 driven = drive(one, lambda _: v_mps, start_m, way_m / v_mps)
                 assert driven.gap_m < 0.0 if (kind, people) != ("conversing", 2) else driven.between
                 assert driven.between or driven.state.phase == "acting"

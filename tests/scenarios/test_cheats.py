@@ -29,9 +29,10 @@ def scenarios_of(kinds: tuple[str, ...], each: int) -> list[str]:
 @pytest.mark.engine
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cheat_solves_no_event(name: str, request: pytest.FixtureRequest) -> None:
-    """On two kinds of event each, on all of them with --whole: no success, and none is left out of the table."""
+    """On one kind of event each, and on each kind one of them; all on all with --whole: no success, and none is left
+    out of the table. Without engines blind drivers are tried on every kind, at every speed."""
     whole, number = request.config.getoption("--whole"), NAMES.index(name)
-    kinds = KINDS if whole else HARDEST.get(name, (KINDS[number % 8], KINDS[(number + 3) % 8]))
+    kinds = KINDS if whole else HARDEST.get(name, (KINDS[number % 8],))
     table = cosim.run("reactive", getattr(cheats, name)(), scenarios=scenarios_of(kinds, 3 if whole else 1))
     assert set(table["status"]) == {"done"} and table["success"].sum() == 0.0
 

@@ -20,7 +20,8 @@ from cosim.records.record import Record, begun
 from cosim.records.run_folder import RunFolder, read_records
 from cosim.records.run_spec import RunSpec
 from cosim.spec.options import RendererAt
-from cosim.spec.scenario import City, Scenario, Suite
+from cosim.spec.scenario import City, Scenario, Suite, write_suite
+from scenarios.checks import small_scenario
 from scenarios.execution import pool
 from scenarios.execution.asked import Asked, Patience, Question
 from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Progress, Ready
@@ -94,10 +95,11 @@ def test_a_policy_that_a_process_cannot_load_ends_the_run(cosim: Cosim, desk: Pa
 def test_an_engine_that_cannot_be_imported_ends_the_run(fresh_cosim: Cosim, desk: Path) -> None:
     """What a process lacks is told once, with the remedy."""
     (desk / "libsumo.py").write_text(MODULES["libsumo"])
+    write_suite(Suite(name="walked", version="1", scenarios=(small_scenario(),)), desk / "walked.json")
     path = os.pathsep.join([str(desk), os.environ.get("PYTHONPATH", str(Path(__file__).parents[2]))])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PYTHONPATH", path)
-        code, said = run(fresh_cosim, desk, "Mine", "long-horizon")
+        code, said = run(fresh_cosim, desk, "Mine", "walked.json")
     assert (code, said.count("error:")) == (3, 1)
     assert "SUMO cannot be loaded: libX11.so.6: cannot open shared object" in said
 

@@ -338,12 +338,18 @@ def test_an_episode_with_residents_is_replayed_and_compared() -> None:
     """They are among the people, the replay has the recorded state hash, and so has the counterfactual's."""
     from cosim.episode.step import Step
     from cosim.judge.referee import Verdict
+    from cosim.place.walk_graph import WalkGraph
     from cosim.policies.load import load_policy
+    from scenarios.builders.long_horizon import build_long_horizon
+    from scenarios.execution.places import place
     from scenarios.execution.replay import Recorded, compared
     from scenarios.execution.run import run_episode
 
-    whole = with_crowd(load_suite("long-horizon"), residents=6)
-    scenario = msgspec.structs.replace(whole.scenarios[0], time_limit_s=10.0)
+    city = City(seed=1, size_m=500.0)
+    _, street_map = place(city)
+    crowd = CrowdSpec(persons=10, radius_m=50.0, vehicles=4, residents=6)
+    whole = build_long_horizon(city, street_map, WalkGraph(street_map), 1, "lived-in")
+    scenario = msgspec.structs.replace(whole, crowd=crowd, time_limit_s=3.0)
     names: set[str] = set()
 
     def watch(step: Step, verdict: Verdict) -> None:
