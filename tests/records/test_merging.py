@@ -178,7 +178,7 @@ def test_a_shard_is_resumed_as_that_shard(tmp_path: Path) -> None:
         RunFolder.resume(first, SPEC)
 
 
-@pytest.mark.parametrize("words", ["0/2", "3/2", "1", "1/0", "-1/2", "a/b", "1/2/3", "²/3"])
+@pytest.mark.parametrize("words", ["0/2", "3/2", "1", "1/0", "-1/2", "a/b", "1/2/3", "²/3"], ids=ascii)
 def test_a_shard_that_is_none_is_refused(words: str) -> None:
     """In one line that says how it is written."""
     with pytest.raises(UsageError, match="give i/n, with i from 1 to n"):

@@ -174,7 +174,8 @@ def test_a_wider_robot_keeps_farther_from_who_stands_and_a_longer_one_stops_earl
 def test_answers_are_clipped_to_the_robot_that_drives() -> None:
     """A command and a waypoint beyond what the third robot can."""
     for answer in (Command(9.0, -9.0), np.array([[2.0, -9.0]] * 3)):
-        assert command_of(answer, rule=WaypointRule(), robot=BARROW) == Command(1.0, -0.4)
+        told = command_of(answer, rule=WaypointRule(), robot=BARROW)
+        assert (told.v_mps, told.w_radps) == (1.0, -0.4)
 
 
 @EVERY

@@ -35,7 +35,8 @@ def test_an_episode_imports_only_what_it_drives_with() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S)
     assert done.returncode == 0, done.stderr
-    assert done.stdout.split("\n")[-3:-1] == ["[] False", "True"]
+    first, *_, last = done.stdout.splitlines()  # between them libsumo may say what it makes of other packages
+    assert (first, last) == ("[] False", "True")
 
 
 @pytest.mark.engine
