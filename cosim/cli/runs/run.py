@@ -45,6 +45,8 @@ _SEED_HELP = (
 )
 _OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
 _SHARD_HELP = "Run only every N-th scenario, from the I-th on; needs --seed. `cosim merge` makes one run of all N."
+_JOBS_HELP = "Environment processes; with --on as many as the cluster has CPUs."
+_ON_HELP = "Run by a Ray cluster: ray (of this machine), auto, or ray://HOST:10001. A policy of yours is sent there."
 _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 
 
@@ -260,6 +262,7 @@ def carry_out(
     "`cosim run long-horizon --policy my_robot.policy:Mine --jobs 10 --shared-renderer`  \n"
     "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --isolated`  \n"
+    "`cosim run reactive --policy my_robot.policy:Mine --on ray://head.lan:10001`, or `--on ray`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
@@ -267,7 +270,15 @@ def carry_out(
     "`cosim run long-horizon --policy route --episodes 2 --counterfactual`  \n"
     "`cosim run reactive --policy orca --scenario frontal-001 --rerun frontal.rrd`",
 )
-@taking(carry_out, without=("carrier",))
-def run_command(**asked: Any) -> None:
+@taking(carry_out, without=("carrier", "jobs"))
+def run_command(
+    jobs: Annotated[int | None, typer.Option(min=1, show_default="1", help=_JOBS_HELP)] = None,
+    on: Annotated[str, typer.Option(metavar="CLUSTER", help=_ON_HELP)] = "",
+    **asked: Any,
+) -> None:
     """Run a suite with a policy and print its table."""
-    carry_out(**asked)
+    if on:
+        from cosim.cli.runs.on_cluster import carried_by_ray
+
+        asked |= {"carrier": carried_by_ray(on, jobs, asked)}
+    carry_out(jobs=1 if on else jobs or 1, **asked)

@@ -1,0 +1,93 @@
+"""On a node of a Ray cluster: an environment process, kept by a Ray actor.
+
+What Ray gives to each node is this actor. It loads no engine: the process beside it does, which is the same as in a run
+on one machine, and what takes that down or hangs in it is told by the actor as it is found by a run on one machine.
+"""
+
+from __future__ import annotations
+
+import shutil
+import socket
+import tempfile
+import threading
+import time
+from multiprocessing.connection import wait
+from pathlib import Path
+from typing import NamedTuple
+
+from scenarios.execution.messages import Message, encode_message
+from scenarios.execution.process import WORKER, KeptProcess
+from scenarios.many.words import Asks, Installed, installed_here
+
+
+class NodeFound(NamedTuple):
+    """Where an actor is, and what is installed there."""
+
+    host: str
+    installed: Installed
+
+
+class Heard(NamedTuple):
+    """What a process has said since, whether it has ended, and what its policy is asked."""
+
+    said: tuple[bytes, ...]
+    ended: bool
+    asks: Asks | None
+
+
+class ProcessEnd(NamedTuple):
+    """How a process ended, in words, and what it printed."""
+
+    words: str
+    in_engine: bool
+    asks: Asks | None
+    printed: bytes
+
+
+class EnvironmentActor:
+    """One environment process. Its methods are called by the run, `hear` beside the others."""
+
+    def __init__(self) -> None:
+        self._logs = Path(tempfile.mkdtemp(prefix="cosim-ray-"))
+        self._process = KeptProcess(self._logs / "process.log", WORKER, "environment")
+        self._turn = threading.Lock()
+        self._open = True
+
+    def found(self) -> NodeFound:
+        """What is here."""
+        return NodeFound(socket.gethostname(), installed_here())
+
+    def send(self, message: bytes) -> None:
+        """Hand the process a message as the run made it: its Hello, then jobs."""
+        with self._turn:
+            self._process.send(message)
+
+    def hear(self, timeout_s: float) -> Heard:
+        """What it has said since the last time; waits for something."""
+        if self._open:
+            wait([self._process.wire.fileno()], timeout_s)
+        said: list[Message] = []
+        with self._turn:
+            goes_on = self._open and self._process.listen(said.append)
+            return Heard(tuple(encode_message(one) for one in said), not goes_on, self._asks())
+
+    def hang_up(self) -> None:
+        """It gets no more jobs."""
+        with self._turn:
+            if self._open:
+                self._process.hang_up()
+
+    def end(self) -> ProcessEnd:
+        """Wait until it has ended, by force if need be."""
+        with self._turn:
+            self._open = False
+            words = self._process.end()
+            printed = Path(self._process.log).read_bytes()
+            shutil.rmtree(self._logs, ignore_errors=True)
+            return ProcessEnd(words, self._process.in_engine, self._asks(), printed)
+
+    def _asks(self) -> Asks | None:
+        question = self._process.question
+        if question is None:
+            return None
+        return Asks(question.doing, question.tick, max(time.monotonic() - question.since_s, 0.0))
