@@ -124,11 +124,10 @@ class Session:
 
         def handed(query: zenoh.Query) -> None:
             asked = Query(query)
-            if "*" in asked.key:
-                if not found:
-                    asked.refuse(f"ask for exactly '{key}', not '{asked.key}'")
-                    return
-                asked.key = key
+            if objection := _objection(query, key, found=found):
+                asked.refuse(objection)
+                return
+            asked.key = key if "*" in asked.key else asked.key
             take(asked)
 
         self._queryables.append(self._session.declare_queryable(key, handed, complete=True))

@@ -45,10 +45,11 @@ def coordinator_command(
     It waits for workers as long as there is something to do. Killed at any moment, and begun again with --resume, it
     goes on where it was, and so do they. `cosim status` tells how it goes.
     """
-    from bridge.session import open_session
+    from bridge.session import notices_of, open_session
     from scenarios.many.workers import workers_of_run
 
     connection = listening("coordinator", "--listen", listen, tls, insecure)
+    notices_of(connection)
 
     @contextmanager
     def carrier() -> Iterator[ReachesWorkers]:

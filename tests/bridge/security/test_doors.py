@@ -14,6 +14,8 @@ from tests.conftest import Cosim
 DOORS = {
     "run --live": ("run", "no-such-suite", "--live"),
     "run --director": ("run", "no-such-suite", "--director"),
+    "coordinator": ("coordinator", "no-such-suite", "--listen"),
+    "worker": ("worker", "--connect"),
     "direct": ("direct", "--listen"),
     "inject": ("inject", "{}", "--connect"),
     "listen": ("listen", "--connect"),
