@@ -18,12 +18,15 @@ from typing import Any, Final
 
 import msgspec
 
+from bridge.codec import decode, encode
 from cosim.core.errors import MachineError, UsageError
 from cosim.records.run_spec import RunSpec
+from cosim.spec.scenario import Place
 from scenarios.execution.asked import Question
 from scenarios.execution.messages import Done, Hear, Hello, Job, decode_message, encode_message
+from scenarios.many.nets import Nets, travels
 from scenarios.many.ray_actor import EnvironmentActor, Heard, NodeFound, ProcessEnd
-from scenarios.many.words import Asks, installed_here
+from scenarios.many.words import Asks, NetAsked, NetPart, installed_here
 
 _POLL_S: Final = 1.0
 _ANSWERS_S: Final = 10.0
@@ -80,7 +83,7 @@ class RayWorkers:
     """Workers that are Ray actors of one CPU each: so many `jobs`, or None for as many as the cluster has CPUs now;
     no more than there are episodes, and fewer while Ray finds no place for more.
 
-    logs: the folder for what they print. wanted: how many there are to be. lost: how many went with their node."""
+    logs: the folder for what they print. wanted: how many there are to be."""
 
     def __init__(self, spec: RunSpec, logs: Path, jobs: int | None, episodes: int, say: _Say) -> None:
         self._ray, self._spec, self._logs, self._say = check_ray("ray"), spec, logs, say
@@ -92,8 +95,9 @@ class RayWorkers:
         self._coming: dict[Any, Any] = {}
         self._placed: list[tuple[Any, NodeFound]] = []
         self._workers: list[_RayWorker] = []
-        self._count = self._failed = self.lost = 0
+        self._count = self._failed = 0
         self._told_s = time.monotonic()
+        self._maps = _Maps(self._ray)
 
     def room(self, busy: int) -> int:
         self._tend()
@@ -106,7 +110,7 @@ class RayWorkers:
         actor, found = self._placed.pop(0)
         log = self._logs / f"ray-{self._count}-{found.host}.log"
         self._count += 1
-        worker = _RayWorker(self._ray, actor, log, hello, self._spec.renderer)
+        worker = _RayWorker(self._ray, actor, log, hello, self._spec.renderer, self._maps)
         self._workers.append(worker)
         return worker
 
@@ -124,7 +128,6 @@ class RayWorkers:
 
     def _tend(self) -> None:
         """Ask Ray for what is wanted, and see what it has placed."""
-        self.lost += sum(one.away for one in self._workers if not one.open)
         self._workers = [one for one in self._workers if one.open]
         for _ in range(self.wanted - len(self._coming) - len(self._placed) - len(self._workers)):
             actor = self._actor.remote()
@@ -160,7 +163,8 @@ class _RayWorker:
 
     in_engine = away = False
 
-    def __init__(self, ray: Any, actor: Any, log: Path, hello: Hello, renderer: str) -> None:
+    def __init__(self, ray: Any, actor: Any, log: Path, hello: Hello, renderer: str, maps: _Maps) -> None:
+        self._maps = maps
         self._renderer = renderer
         self._ray, self._actor, self.log, self.open = ray, actor, str(log), True
         self._asks: Asks | None = None
@@ -176,7 +180,10 @@ class _RayWorker:
         return self._asks.question(self._heard_s + 2.0 * _POLL_S)
 
     def give(self, job: Job) -> None:
-        self._actor.send.remote(encode_message(job))
+        where = job.scenario.place
+        digest = self._maps.hash_of(where)
+        message = encode_message(msgspec.structs.replace(job, net_hash=digest))
+        self._actor.give.remote(message, where, digest, self._maps.parts_of(where))
 
     def listen(self, hear: Hear) -> bool:
         while self.open and self._ray.wait([self.hearing], timeout=0)[0]:
@@ -225,6 +232,32 @@ class _RayWorker:
         if self.open:
             self.kill()
         return self._lost
+
+
+class _Maps:
+    """The imported maps of a run, in the cluster's memory once they are needed."""
+
+    def __init__(self, ray: Any) -> None:
+        self._ray, self._nets = ray, Nets()
+        self._there: dict[str, Any] = {}
+
+    def hash_of(self, where: Place) -> str:
+        return self._nets.hash_of(where)
+
+    def parts_of(self, where: Place) -> Any:
+        """A reference to what is sent of a place; nothing for one that every node makes by itself."""
+        if not travels(where):
+            return ()
+        digest = self.hash_of(where)
+        if digest not in self._there:
+            parts: list[bytes] = []
+            begin, whole = 0, 1
+            while begin < whole:
+                parts.append(self._nets.part(digest, encode(NetAsked(begin))))
+                one = decode(parts[-1], NetPart)
+                begin, whole = begin + len(one.data), one.whole
+            self._there[digest] = self._ray.put(parts)
+        return self._there[digest]
 
 
 class _Told(msgspec.Struct):

@@ -11,11 +11,14 @@ import socket
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import NamedTuple
 
-from scenarios.execution.messages import Message, encode_message
+from cosim.core.errors import CosimError
+from cosim.spec.scenario import CityMap, Place
+from scenarios.execution.messages import Message, Unable, encode_message
 from scenarios.execution.process import WORKER, KeptProcess
 from scenarios.many.words import Asks, Installed, installed_here
 
@@ -52,22 +55,37 @@ class EnvironmentActor:
         self._process = KeptProcess(self._logs / "process.log", WORKER, "environment")
         self._turn = threading.Lock()
         self._open = True
+        self._trouble: list[Message] = []
 
     def found(self) -> NodeFound:
         """What is here."""
         return NodeFound(socket.gethostname(), installed_here())
 
     def send(self, message: bytes) -> None:
-        """Hand the process a message as the run made it: its Hello, then jobs."""
+        """Hand the process a message as the run made it: its Hello."""
         with self._turn:
             self._process.send(message)
+
+    def give(self, message: bytes, where: Place, digest: str, parts: Sequence[bytes]) -> None:
+        """Hand the process a job. parts: of the map that it takes place on, where that is not made anew here."""
+        try:
+            if parts:
+                from scenarios.many.nets import Fetched, lacks  # with the importer of maps
+
+                if isinstance(where, CityMap) and lacks(where):
+                    fetched = Fetched(where, digest)
+                    for part in parts:
+                        fetched.take(part)
+        except CosimError as error:
+            self._trouble.append(Unable(str(error), blames_policy=False))
+        self.send(message)
 
     def hear(self, timeout_s: float) -> Heard:
         """What it has said since the last time; waits for something."""
         if self._open:
             wait([self._process.wire.fileno()], timeout_s)
-        said: list[Message] = []
         with self._turn:
+            said, self._trouble = self._trouble, []
             goes_on = self._open and self._process.listen(said.append)
             return Heard(tuple(encode_message(one) for one in said), not goes_on, self._asks())
 

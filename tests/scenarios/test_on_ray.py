@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,15 +13,9 @@ import msgspec
 import pytest
 
 from cosim.core.errors import UsageError
-from cosim.policies.load import load_policy
-from cosim.records.run_folder import RunFolder
-from cosim.spec.options import EpisodeOptions
-from cosim.spec.scenario import Suite
+from cosim.records.run_folder import read_spec
+from cosim.spec.scenario import Suite, write_suite
 from scenarios.checks import small_scenario
-from scenarios.execution.messages import Hello, Message, Progress
-from scenarios.execution.pool import run_all
-from scenarios.execution.process import LocalProcesses
-from scenarios.execution.suite_run import run_spec
 from scenarios.many.on_ray import RayWorkers, ray_cluster
 from tests.conftest import PATIENCE_S, Cosim
 
@@ -36,7 +32,8 @@ class Waits:
     manifest = Manifest("waits", rate_hz=4.0, camera=None)
 
     def reset(self, episode_id, seed):
-        pass
+        go = Path(os.environ["COSIM_TEST_GO"])
+        (go.parent / f"begun-{os.getpid()}-{episode_id}").touch()
 
     def act(self, observation):
         while observation.time_s > 0.0 and not Path(os.environ["COSIM_TEST_GO"]).exists():
@@ -71,47 +68,39 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
 
 @pytest.mark.engine
 def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
-    tmp_path: Path, nodes: tuple[Any, list[Any], Path], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
 ) -> None:
     """A policy that only this machine has is sent there; a node is killed while both run an episode: the episode that
-    was lost is run again, and the tables are equal to the byte."""
+    was lost is run again, and the tables are equal to the byte. Nodes of other versions are refused."""
     cluster, (first, _), go = nodes
     (tmp_path / "only_here.py").write_text(POLICY)
-    monkeypatch.syspath_prepend(tmp_path)
-    policy = "only_here:Waits"
     one = msgspec.structs.replace(small_scenario(), time_limit_s=2.0)
-    whole = Suite(
-        name="four", version="1",
-        scenarios=tuple(msgspec.structs.replace(one, id=f"n-{i}", seed=i) for i in range(SCENARIOS)),
-    )  # fmt: skip
-    loaded = load_policy(policy)
-    hello = Hello(policy, loaded.manifest, loaded.source_hash)
-    spec = run_spec(whole, whole.scenarios, policy, loaded, EpisodeOptions(seed=3))
-    begun: set[str] = set()
-    told: list[str] = []
+    each = tuple(msgspec.structs.replace(one, id=f"n-{i}", seed=i) for i in range(SCENARIOS))
+    write_suite(Suite(name="four", version="1", scenarios=each), tmp_path / "four.json")
 
-    def hear(message: Message) -> None:
-        if isinstance(message, Progress):
-            begun.add(message.scenario)
-        if len(begun) == 2 and not go.exists():
-            cluster.remove_node(first, allow_graceful=False)
-            go.touch()
+    def kill_one() -> None:
+        while len([*go.parent.glob("begun-*")]) < 2:
+            time.sleep(0.05)
+        cluster.remove_node(first, allow_graceful=False)
+        go.touch()
 
-    with RunFolder.create(tmp_path / "ray", spec, whole) as held, ray_cluster("ray", policy, told.append):
-        workers = RayWorkers(spec, held.path / "logs", None, SCENARIOS, told.append)
-        assert workers.wanted == 2
-        run_all(held, whole.scenarios, hello, workers, tell=hear)
-        held.finish()
-        with pytest.raises(UsageError, match=r"node .* has numpy .* in place of 0\.1: install on the nodes"):
-            other = RayWorkers(
-                msgspec.structs.replace(spec, versions=spec.versions | {"numpy": "0.1"}), held.path, 1, 1, told.append
-            )
-            run_all(held, whole.scenarios[:1], hello, other, tell=hear)
-    assert go.exists() and workers.lost == 1
-    with RunFolder.create(tmp_path / "here", spec, whole) as held:
-        run_all(held, whole.scenarios, hello, LocalProcesses(held.path / "logs"), tell=lambda _: None)
-        held.finish()
+    killer = threading.Thread(target=kill_one, daemon=True)
+    killer.start()
+    words = ("run", "four.json", "--policy", "only_here:Waits", "--seed", "3", "--out")
+    said = cosim(*words, "ray", "--on", "ray", cwd=tmp_path)
+    assert "2 workers on Ray" in said.stderr and said.returncode == 0, said
+    killer.join(PATIENCE_S)
+    assert len([*go.parent.glob("begun-*")]) > SCENARIOS, "the episode of the node that died was not run again"
+    assert cosim(*words, "here", cwd=tmp_path).returncode == 0
     assert (tmp_path / "ray/results.csv").read_bytes() == (tmp_path / "here/results.csv").read_bytes()
+
+    spec = read_spec(tmp_path / "ray")
+    others = msgspec.structs.replace(spec, versions=spec.versions | {"numpy": "0.1"})
+    with ray_cluster("auto", "straight", print):
+        workers = RayWorkers(others, tmp_path, 1, 1, print)
+        with pytest.raises(UsageError, match=r"node .* has numpy .* in place of 0\.1: install on the nodes"):
+            while not workers.room(0):
+                workers.wait(1.0)
 
 
 def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from cosim.cli.terminal.consoles import err
 from cosim.core.errors import UsageError
 
 if TYPE_CHECKING:
+    from cosim.cli.runs.run import ReachesWorkers
     from cosim.records.run_folder import RunFolder
     from cosim.spec.scenario import Scenario
     from scenarios.execution.asked import Patience
@@ -19,26 +20,33 @@ if TYPE_CHECKING:
 _ALONE = ("shared_renderer", "real_time", "live", "rerun")
 
 
-def carried_by_ray(on: str, jobs: int | None, asked: Mapping[str, Any]) -> Callable[..., AbstractContextManager[Any]]:
-    """The carrier of a run by a Ray cluster. Raises UsageError without Ray, and for options of local processes."""
-    from scenarios.many.on_ray import RayWorkers, check_ray, ray_cluster
+def check_on(on: str, asked: Mapping[str, Any]) -> None:
+    """Raises UsageError without Ray, for what is no cluster's name, and for options of local processes."""
+    from scenarios.many.on_ray import check_ray
 
     check_ray(on)
     for name in _ALONE:
         if asked[name]:
             raise UsageError(f"--{name.replace('_', '-')} is of processes of this machine: leave it, or --on, out")
 
-    @contextmanager
-    def carried(
-        held: RunFolder, todo: Sequence[Scenario], picked: Sequence[Scenario], hello: Hello, patience: Patience,
-        tell: Hear,
-    ) -> Iterator[tuple[Transport, Hear]]:  # fmt: skip
-        with ray_cluster(on, hello.policy, _say):
+
+@contextmanager
+def carried_by_ray(on: str, jobs: int | None, policy: str) -> Iterator[ReachesWorkers]:
+    """A connection to a Ray cluster, and how its workers are reached."""
+    from scenarios.many.on_ray import RayWorkers, ray_cluster
+
+    with ray_cluster(on, policy, _say):
+
+        @contextmanager
+        def reached(
+            held: RunFolder, todo: Sequence[Scenario], picked: Sequence[Scenario], hello: Hello, patience: Patience,
+            tell: Hear,
+        ) -> Iterator[tuple[Transport, Hear]]:  # fmt: skip
             workers = RayWorkers(held.spec, held.path / "logs", jobs, len(todo), _say)
             _say(f"{workers.wanted} workers on Ray")
             yield workers, tell
 
-    return carried
+        yield reached
 
 
 def _say(words: str) -> None:

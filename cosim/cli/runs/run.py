@@ -278,7 +278,8 @@ def run_command(
 ) -> None:
     """Run a suite with a policy and print its table."""
     if on:
-        from cosim.cli.runs.on_cluster import carried_by_ray
+        from cosim.cli.runs.on_cluster import carried_by_ray, check_on
 
-        asked |= {"carrier": carried_by_ray(on, jobs, asked)}
+        check_on(on, asked)
+        asked["carrier"] = carried_by_ray(on, jobs, asked["policy"])
     carry_out(jobs=1 if on else jobs or 1, **asked)
