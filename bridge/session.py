@@ -32,6 +32,8 @@ _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 _ANSWER = "answer"
 _WRITTEN = ("zenoh/bytes", "application/msgpack", "application/json", "text/json", "text/plain", "zenoh/string")
 """How a message may say that it is written: as none that makes objects of any kind."""
+_LONGEST_FOLDER = 70
+"""Letters: the whole path of a Unix socket has at most 107."""
 _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
 
@@ -342,7 +344,8 @@ def _listening(connection: Connection, more: Mapping[str, object]) -> Session:
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)
         return Session(_open("router", [connection.listen], [], failure, remedy, more), inside)
-    folder = Path(tempfile.mkdtemp(prefix="cosim-"))
+    brief = tempfile.gettempdir() if len(tempfile.gettempdir()) < _LONGEST_FOLDER else "/tmp"
+    folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=brief))
     inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
         return Session(_open("router", [connection.listen, inside.connect], [], failure, remedy, more), inside, folder)

@@ -16,6 +16,7 @@ DOORS = {
     "run --director": ("run", "no-such-suite", "--director"),
     "coordinator": ("coordinator", "no-such-suite", "--listen"),
     "worker": ("worker", "--connect"),
+    "status": ("status", "--connect"),
     "direct": ("direct", "--listen"),
     "inject": ("inject", "{}", "--connect"),
     "listen": ("listen", "--connect"),

@@ -107,7 +107,8 @@ class Guest:
         self.air, self.session = air, stack.enter_context(plain_zenoh(air.at, air.certs, role))
         self.heard: list[str] = []
         self.session.declare_queryable("cosim/r/policy/theirs/info", self._answer)
-        for key in (*JOBS, *SEEN, *TOLD, f"{ENV}/inject", f"{ENV}/director"):
+        everything = [] if role in ("policy", "") else [POLICY, "cosim/*/policy/**", "cosim/**"]
+        for key in (*JOBS, *SEEN, *TOLD, f"{ENV}/inject", f"{ENV}/director", *everything):
             self.session.declare_queryable(key, self._answer)
         for key in (*TOLD, *JOBS, POLICY, "cosim/r/policy/**", "cosim/**", "**"):
             self.session.declare_subscriber(key, self._hear)
