@@ -11,7 +11,7 @@ import re
 import shutil
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -19,7 +19,7 @@ from typing import Any, Self
 
 import zenoh
 
-from bridge.security.rights import access_of
+from bridge.security.settings import settings_alone, settings_of
 from cosim.core.errors import AccessError, EngineError
 from cosim.spec.connection import Connection
 
@@ -36,26 +36,6 @@ _LONGEST_FOLDER = 70
 """Letters: the whole path of a Unix socket has at most 107."""
 _FIRST_RETRY_S = 0.005
 _LONGEST_RETRY_S = 0.2
-
-
-def _config(mode: str, listen: Sequence[str], connect: Sequence[str], more: Mapping[str, object]) -> zenoh.Config:
-    settings: dict[str, object] = {
-        "mode": mode,
-        "listen/endpoints": list(listen),
-        "connect/endpoints": list(connect),
-        "scouting/multicast/enabled": False,
-        "scouting/delay": 0,
-        "connect/timeout_ms": 2000 if mode == "client" else 0,
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
-        "transport/link/tx/lease": 2000,
-        "transport/shared_memory/enabled": False,
-        "transport/link/rx/max_message_size": 16 << 20,
-        **more,
-    }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return config
 
 
 class Query:
@@ -257,7 +237,7 @@ class LoneSession(Session):
     """
 
     def __init__(self) -> None:
-        super().__init__(_open("peer", [], [], "cannot open a session", "Has this machine threads to spare?", {}))
+        super().__init__(_open(settings_alone(), "cannot open a session", "Has this machine threads to spare?"))
         self._served: list[tuple[_Heard, _Heard, Handler]] = []
 
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
@@ -306,10 +286,7 @@ def open_session(connection: Connection, say: Callable[[str], None] = lambda _: 
     b'WELL?'
     """
     notices = notices_of(connection)
-    more: dict[str, object] = {"transport/link/tls": _tls(Path(connection.tls))} if connection.tls else {}
-    if connection.listen:
-        more |= access_of(connection)
-    session = _listening(connection, more) if connection.listen else _connected(connection, more)
+    session = _listening(connection) if connection.listen else _connected(connection)
     for line in notices:
         say(line)
     return session
@@ -325,41 +302,26 @@ def notices_of(connection: Connection) -> list[str]:
     return [line for line in (connection.warning, soon) if line]
 
 
-def _tls(folder: Path) -> dict[str, object]:
-    certificate, key = str(folder / "cert.pem"), str(folder / "key.pem")
-    return {
-        "root_ca_certificate": str(folder / "ca.pem"),
-        "listen_certificate": certificate,
-        "listen_private_key": key,
-        "connect_certificate": certificate,
-        "connect_private_key": key,
-        "enable_mtls": True,
-        "verify_name_on_connect": True,
-    }
-
-
-def _listening(connection: Connection, more: Mapping[str, object]) -> Session:
+def _listening(connection: Connection) -> Session:
     remedy = "Choose an address of this machine and a port that nobody uses, like tcp/127.0.0.1:7450."
     failure = f"cannot listen at {connection.listen}"
     if connection.listen.startswith("unixsock-stream/"):
         inside = Connection(role=connection.role, connect=connection.listen)
-        return Session(_open("router", [connection.listen], [], failure, remedy, more), inside)
+        return Session(_open(settings_of(connection), failure, remedy), inside)
     brief = tempfile.gettempdir() if len(tempfile.gettempdir()) < _LONGEST_FOLDER else "/tmp"
     folder = Path(tempfile.mkdtemp(prefix="cosim-", dir=brief))
     inside = Connection(role=connection.role, connect=f"unixsock-stream/{folder}/hub.sock")
     try:
-        return Session(_open("router", [connection.listen, inside.connect], [], failure, remedy, more), inside, folder)
+        return Session(_open(settings_of(connection, [inside.connect]), failure, remedy), inside, folder)
     except BaseException:
         shutil.rmtree(folder, ignore_errors=True)
         raise
 
 
-def _connected(connection: Connection, more: Mapping[str, object]) -> Session:
+def _connected(connection: Connection) -> Session:
     remedy = "Is a process started that listens there, by the same protocol and port?"
     try:
-        return Session(
-            _open("client", [], [connection.connect], f"no hub answers at {connection.connect}", remedy, more)
-        )
+        return Session(_open(settings_of(connection), f"no hub answers at {connection.connect}", remedy))
     except EngineError as error:
         if connection.tls:
             from bridge.security.refusal import why_refused
@@ -369,10 +331,11 @@ def _connected(connection: Connection, more: Mapping[str, object]) -> Session:
         raise
 
 
-def _open(
-    mode: str, listen: Sequence[str], connect: Sequence[str], failure: str, remedy: str, more: Mapping[str, object]
-) -> zenoh.Session:
+def _open(settings: Mapping[str, object], failure: str, remedy: str) -> zenoh.Session:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
     try:
-        return zenoh.open(_config(mode, listen, connect, more))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         raise EngineError(f"Zenoh: {failure} ({_SOURCE_LINE.sub('', str(error)).rstrip('.')}). {remedy}") from error
