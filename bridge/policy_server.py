@@ -1,17 +1,27 @@
-"""Answers for a policy that is asked from another process: the messages, and who keeps its episodes apart.
+"""Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9, here or elsewhere.
 
-The simulator asks and waits. Each question is signed with run, episode, attempt and step, and may come again: then the
-kept answer is given again, and the policy is not asked twice. Nothing of cosim is imported here, and Python may be 3.9.
+One file, to be copied beside a policy: it needs eclipse-zenoh, msgspec and numpy, and nothing of cosim. `serve` asks
+the policy in the thread that calls it. The simulator asks and waits; each question is signed with run, episode, attempt
+and step and may come again: then the kept answer is given again, and the policy is not asked twice.
 """
 
 from __future__ import annotations
 
+import hashlib
+import inspect
+import json
 import os
 import platform
+import queue
+import re
+import secrets
+import signal
 import time
 import traceback
 from collections.abc import Sequence
-from io import BytesIO
+from contextlib import nullcontext, suppress
+from ipaddress import ip_address
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, Optional, Union
 
@@ -21,12 +31,16 @@ import numpy as np
 POLICY_PROTOCOL = 1
 """Raised whenever the messages below change their meaning."""
 MOST_WORDS = 500
+MOST_MESSAGE_BYTES = 16 << 20
+_WINDOW_S = 0.002
+"""So long a policy with act_batch is not asked for those who wait, while others are about to."""
 _MOST_SEATS = 4096
 _FORGOTTEN_AFTER_S = 300.0
 _TAKEN_OVER_AFTER_S = 30.0
 """A policy object that answers for one episode at a time is free again when it was asked nothing for so long."""
 _MOST_NUMBERS = 100_000
-_KINDS = {"|u1", "<f4"}
+_ARRAYS = {"|u1", "<f4"}
+_QUESTIONS = ("reset", "act", "ended")
 
 
 class PackedArray(msgspec.Struct, frozen=True):
@@ -87,13 +101,14 @@ class AskEnded(_Signed, frozen=True, tag="ended"):
 
 class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     """Who answers here. source: a hash of the policy's source, "" where that is unknown; at_once: for so many episodes
-    it can answer at a time, 0 for any number; jpeg: it asks for pictures as JPEG."""
+    it can answer at a time, 0 for any number; under_way: there are so many; jpeg: it asks for pictures as JPEG."""
 
     server: str
     name: str
     manifest: dict[str, Any]
     source: str = ""
     at_once: int = 0
+    under_way: int = 0
     jpeg: bool = False
     python: str = platform.python_version()
     protocol: int = POLICY_PROTOCOL
@@ -160,6 +175,11 @@ class PolicyDesk:
         self._idle = [] if self.batches else [self.policy]
         self._seats: dict[tuple[str, str], _Seat] = {}
         self._observe, self._memory = observe or _plain_observation, memory
+
+    @property
+    def under_way(self) -> int:
+        """How many episodes have begun and not ended."""
+        return len(self._seats)
 
     def answers(self, payloads: Sequence[bytes]) -> list[bytes]:
         """The reply to each message; those that ask a policy with act_batch are answered together."""
@@ -266,16 +286,16 @@ class PolicyDesk:
         return seen
 
 
-def _from_jpeg(data: bytes) -> Any:
-    """(H, W, 3) uint8. Raises ValueError. OpenCV or Pillow is needed only by who asks for JPEG."""
+def _from_jpeg(data: memoryview) -> Any:
+    """(H, W, 3) uint8. Only who asks for JPEG needs OpenCV or Pillow. Raises ValueError."""
     try:
         import cv2
 
-        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
-        if picture is None:
-            raise ValueError("no JPEG")
-        return picture[..., ::-1].copy()
+        bgr = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        return np.ascontiguousarray(np.asarray(bgr)[..., ::-1])
     except ImportError:
+        from io import BytesIO
+
         from PIL import Image
 
         return np.array(Image.open(BytesIO(data)).convert("RGB"))
@@ -290,8 +310,8 @@ def _read(payload: bytes) -> Any:
 
 def _unpacked(told: PackedArray, memory: memoryview | None) -> Any:
     if told.jpeg:
-        return _from_jpeg(bytes(told.data)).reshape(told.shape)
-    if told.dtype not in _KINDS or any(side < 0 for side in told.shape):
+        return _from_jpeg(told.data).reshape(told.shape)
+    if told.dtype not in _ARRAYS or any(side < 0 for side in told.shape):
         raise ValueError(f"an array of {told.dtype} {told.shape}")
     count = int(np.prod(told.shape, dtype=np.int64))
     if told.at < 0:
@@ -330,7 +350,9 @@ def _answer(one: AskAct, answer: Any) -> Union[Answer, Refusal]:
 
 
 def _crash(error: BaseException, among: str = "") -> bytes:
-    """What is said of whatever came out of a policy; the rest is printed."""
+    """What is said of whatever came out of a policy; the rest is printed. Ctrl-C stays what it is."""
+    if isinstance(error, KeyboardInterrupt) and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        raise error
     traceback.print_exception(type(error), error, error.__traceback__)
     try:
         said = str(error)
@@ -368,3 +390,107 @@ def _plain_observation(told: str, about: AboutEpisode, one: AskAct, arrays: dict
             for name, (rgb, depth, labels) in picture.items()
         },
     )  # fmt: skip
+
+
+def serve(
+    policy: Any, *, name: str = "", listen: str = "", connect: str = "", domain: str = "default", jpeg: bool = False,
+    tls: str = "", insecure: bool = False, told: Any = None, source: str = "", observe: Any = None,
+    session: Any = None,
+) -> None:  # fmt: skip
+    """Answer for a policy until Ctrl-C.
+
+    policy: an object; or a class, of which there is then one for each episode (`PolicyDesk`). told: its manifest, in
+    place of `policy.manifest`: a mapping with the fields of `cosim.Manifest`; source: a hash of what it is written in.
+    name: what runs ask for, else the manifest's. listen, connect: one of both, as tcp/127.0.0.1:7449. tls: a folder
+    with ca.pem, cert.pem and key.pem (`cosim certs`). insecure: it may reach beyond this machine without. jpeg:
+    pictures are to come as JPEG. session: an open Zenoh session, in place of all that. Raises ValueError.
+    """
+    desk = PolicyDesk(policy, observe=observe)
+    manifest = msgspec.to_builtins(desk.policy.manifest if told is None else told)
+    name, server = name or manifest["name"], secrets.token_hex(4)
+    if not all(re.fullmatch(r"[A-Za-z0-9_-]{1,64}", part) for part in (name, domain)):
+        raise ValueError(f"'{name}' or '{domain}' cannot stand in a key: use 1 to 64 of A-Z a-z 0-9 _ -")
+    below, source = policy_key(domain, name, server), source or _source_of(desk.policy)
+    asked: queue.SimpleQueue[Any] = queue.SimpleQueue()
+
+    def tell(query: Any) -> None:
+        with query:
+            info = PolicyInfo(server, name, manifest, source, desk.at_once, desk.under_way, jpeg)
+            query.reply(f"{below}/info", encode_asked(info))
+
+    with (
+        nullcontext(session) if session else _opened(listen, connect, tls, insecure) as opened,
+        suppress(KeyboardInterrupt),
+    ):
+        declared = [opened.declare_queryable(f"{below}/info", tell, complete=True)]
+        declared += [opened.declare_queryable(f"{below}/{kind}", asked.put, complete=True) for kind in _QUESTIONS]
+        print(f"policy '{name}' answers at {listen or connect} as server {server}; stop with Ctrl-C", flush=True)
+        while True:
+            _answer_waiting(desk, asked, below)
+
+
+def _answer_waiting(desk: PolicyDesk, asked: Any, below: str) -> None:
+    """Answer what is waiting, at least one question."""
+    queries, until_s = [asked.get()], time.monotonic() + _WINDOW_S
+    with suppress(queue.Empty):
+        while True:
+            waits = desk.batches and len(queries) < desk.under_way
+            queries.append(asked.get(timeout=max(until_s - time.monotonic(), 0.0) if waits else 0.0))
+    payloads = [b"" if query.payload is None else query.payload.to_bytes() for query in queries]
+    for query, reply in zip(queries, desk.answers(payloads)):
+        with query:
+            if isinstance(decode_answered(reply), Refusal):
+                query.reply_err(reply)
+            elif str(query.key_expr).startswith(f"{below}/"):
+                query.reply(query.key_expr, reply)
+
+
+def policy_key(domain: str, name: str, server: str) -> str:
+    """What the keys of a server begin with; _QUESTIONS of questions, and `info`, stand below."""
+    return f"cosim/{domain}/policy/{name}/{server}"
+
+
+def _source_of(policy: Any) -> str:
+    with suppress(OSError, TypeError):
+        source = Path(inspect.getfile(type(policy))).read_bytes() + type(policy).__qualname__.encode()
+        return hashlib.blake2b(source, digest_size=8).hexdigest()
+    return ""
+
+
+def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
+    """A Zenoh session that reaches no further than it says."""
+    import zenoh
+
+    found = re.fullmatch(r"(tcp|tls)/(.+):\d{1,5}|unixsock-stream/.+", listen or connect)
+    if not found or (listen and connect):
+        raise ValueError(f"listen or connect, one of both, like tcp/127.0.0.1:7449, not '{listen}' and '{connect}'")
+    host = (found[2] or "localhost").strip("[]")
+    with suppress(ValueError):
+        host = "localhost" if ip_address(host).is_loopback else host
+    if host != "localhost" and not insecure and not (tls and found[1] == "tls"):
+        raise ValueError(
+            f"{found[0]} is beyond this machine and unguarded: whoever can reach it may ask the policy and read all "
+            "that is sent. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
+        )
+    settings: dict[str, Any] = {
+        "mode": "router" if listen else "client",
+        "listen/endpoints": [listen] if listen else [],
+        "connect/endpoints": [connect] if connect else [],
+        "connect/timeout_ms": 0 if listen else 10_000,
+        "scouting/multicast/enabled": False,
+        "transport/link/tx/lease": 2000,
+        "transport/shared_memory/enabled": False,
+        "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
+    }
+    if tls:
+        guard: dict[str, Any] = {"root_ca_certificate": str(Path(tls, "ca.pem")), "enable_mtls": True}
+        for end in ("listen", "connect"):
+            guard[f"{end}_certificate"], guard[f"{end}_private_key"] = (
+                str(Path(tls, "cert.pem")),
+                str(Path(tls, "key.pem")),
+            )
+        settings["transport/link/tls"] = guard
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import zenoh
 
@@ -61,6 +61,16 @@ class Query:
                 query.reply_err(words.encode())
 
 
+HowHeard = Literal["answered", "refused", "late", "nobody"]
+
+
+class QueryHeard(NamedTuple):
+    """What came of a query: an answer, an error of the other side's, nothing in time, or nobody is there."""
+
+    how: HowHeard
+    payload: bytes = b""
+
+
 class Session:
     """An open Zenoh session. Use as a context manager: a session left open keeps the process alive.
 
@@ -73,6 +83,11 @@ class Session:
         self._queryables: list[zenoh.Queryable[None]] = []
         self._subscribers: list[zenoh.Subscriber[Any]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
+
+    @property
+    def itself(self) -> zenoh.Session:
+        """What Zenoh opened, for the one file that answers by it without this one (`bridge.policy_server`)."""
+        return self._session
 
     @property
     def inside(self) -> Connection:
@@ -169,6 +184,20 @@ class Session:
 
         self._subscribers.append(self._session.declare_subscriber(key, heard))
 
+    def ask_once(self, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
+        """What comes of one query, whoever answers it first."""
+        how: HowHeard = "nobody"
+        # Unconsolidated: else a reply is held back until every other side has said that it has none.
+        one_by_one = zenoh.ConsolidationMode.NONE
+        for reply in self._session.get(key, payload=payload, timeout=timeout_s, consolidation=one_by_one):
+            if reply.ok is not None:
+                return QueryHeard("answered", bytes(reply.ok.payload.to_bytes()))
+            message = bytes(reply.err.payload.to_bytes()) if reply.err is not None else b""
+            if message != b"Timeout":
+                return QueryHeard("refused", message)
+            how = "late"
+        return QueryHeard(how)
+
     def ask(self, key: str, payload: bytes, *, timeout_s: float) -> bytes:
         """The reply to one query. Asks again while nobody answers, until `timeout_s` is over.
 
@@ -177,16 +206,11 @@ class Session:
         deadline = time.monotonic() + timeout_s
         pause_s = _FIRST_RETRY_S
         while (left_s := deadline - time.monotonic()) > 0:
-            # Unconsolidated: else a reply is held back until every other side has said that it has none.
-            replies = self._session.get(
-                key, payload=payload, timeout=left_s, consolidation=zenoh.ConsolidationMode.NONE
-            )
-            for reply in replies:
-                if reply.ok is not None:
-                    return bytes(reply.ok.payload.to_bytes())
-                message = reply.err.payload.to_string() if reply.err is not None else ""
-                if message != "Timeout":
-                    raise EngineError(f"'{key}' answered: {message}")
+            heard = self.ask_once(key, payload, timeout_s=left_s)
+            if heard.how == "answered":
+                return heard.payload
+            if heard.how == "refused":
+                raise EngineError(f"'{key}' answered: {heard.payload.decode(errors='replace')}")
             time.sleep(min(pause_s, max(deadline - time.monotonic(), 0.0)))
             pause_s = min(2 * pause_s, _LONGEST_RETRY_S)
         raise TimeoutError(f"nobody answered on '{key}' for {timeout_s:g} s")

@@ -13,6 +13,7 @@ from cosim.cli.installation.verify import installation_app
 from cosim.cli.network.certs import certs_app
 from cosim.cli.network.direct import direct_app
 from cosim.cli.network.live import live_app
+from cosim.cli.network.serve import serve_app
 from cosim.cli.options.panels import MEASURE, PLACES, STEP_IN
 from cosim.cli.pictures.export import export_app
 from cosim.cli.pictures.film import film_app
@@ -48,7 +49,7 @@ app = typer.Typer(
 for commands in (
     *(run_app, list_app, show_app, installation_app),
     *(look_app, film_app, report_app, replay_app, export_app, counterfactual_app),
-    *(live_app, direct_app, merge_app, coordinator_app, status_app),
+    *(live_app, direct_app, serve_app, merge_app, coordinator_app, status_app),
     *(bench_app, score_app, compare_app),
 ):
     app.add_typer(commands)

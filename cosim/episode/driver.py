@@ -56,10 +56,11 @@ class Driver:
 
     manifest: what the policy is, read once; later changes of `policy.manifest` mean nothing.
     source_hash: of the file it is written in, "" where that is unknown (`cosim.policies.load`). runs: where it
-    is asked.
+    is asked; at_once: for so many episodes at a time, 0 for any number.
     """
 
     runs: PolicyRuns = "in-process"
+    at_once = 0
 
     def __init__(
         self,

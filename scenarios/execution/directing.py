@@ -75,7 +75,7 @@ class AmongObstacles:
         return self._director.react(msgspec.structs.replace(query, standing=near) if near else query)
 
 
-def serve(session: Session) -> None:
+def direct_all(session: Session) -> None:
     """Direct every run and episode that asks on this session."""
     serve_director(session, keys.EVERY_DIRECTOR, react, behaviours())
 

@@ -249,7 +249,7 @@ class _Pool:
         if record is None:
             self.give_up(scenario, "its record was damaged when it arrived")
         elif done.again:
-            self._again.append(_Lost(scenario, record.reason, in_engine=True))
+            self._again.append(_Lost(scenario, record.reason, in_engine=record.status == "invalid"))
         else:
             self._folder.keep(record, done.log)
             self._over(scenario, record.status)

@@ -8,7 +8,15 @@ from dataclasses import dataclass
 
 import msgspec
 
-from cosim.core.errors import CosimError, DirectorLost, EngineError, MachineError, PolicyError, RendererLost
+from cosim.core.errors import (
+    CosimError,
+    DirectorLost,
+    EngineError,
+    MachineError,
+    PolicyError,
+    PolicyServerLost,
+    RendererLost,
+)
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.log import Log
 from cosim.episode.ports import Policy
@@ -41,7 +49,8 @@ def run_episode(
 ) -> Outcome:
     """Run one scenario to its end. Whatever goes wrong inside becomes a record, `crashed` where it was the policy,
     `invalid` where it was anything else; but for a shared renderer that has ended: then it raises RendererLost, and is
-    to be run again; and for what the machine lacks: MachineError, which is no episode's fault.
+    to be run again; and for what the machine lacks: MachineError, which is no episode's fault. One whose policy server
+    is gone is to be run again, and has crashed if it is not.
 
     watches, waiting: see `Episode`. comparing: told how far the comparison with the street without the robot has come.
     """
@@ -59,7 +68,7 @@ def run_episode(
     except (RendererLost, MachineError):
         raise
     except Exception as error:  # noqa: BLE001  here a failing episode is turned into its record
-        by_policy = isinstance(error, PolicyError)
+        by_policy = isinstance(error, PolicyError | PolicyServerLost)
         status: Status = "crashed" if by_policy else "invalid"
         record = msgspec.structs.replace(episode.record, status=status, reason=in_words(error))
         another_time = isinstance(error, EngineError) or not isinstance(error, CosimError)

@@ -83,7 +83,7 @@ def run(
     whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
     picked = scenarios_chosen(whole, scenarios, episodes, events)
     check_places(whole, picked)
-    driver = known_driver(policy, host) if isinstance(policy, str) else Driver.of(policy)
+    driver = known_driver(policy, host, jobs) if isinstance(policy, str) else Driver.of(policy)
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
     options = _settled(options, whole, driver, seed_of_run(options.seed, Path(out) if resume and out else None))
     check_alone(options, jobs, shared_renderer)

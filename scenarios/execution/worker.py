@@ -107,8 +107,8 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
                 f"policy '{hello.policy}' has another manifest in each process: {driver.manifest} in this one, "
                 f"{hello.manifest} in the first"
             )
-    except UsageError as error:
-        say(Unable(str(error), blames_policy=True))
+    except (UsageError, MachineError) as error:
+        say(Unable(str(error), blames_policy=isinstance(error, UsageError)))
         raise
     return driver
 

@@ -86,7 +86,8 @@ class HostedPolicy:
         wanted = Begun if isinstance(question, AskReset) else Answer
         step = reply.step if isinstance(reply, Answer) else -1
         if not isinstance(reply, wanted) or reply.signature != self._sign or step != self._step:
-            raise PolicyError(f"answered step {step} of '{reply.episode}' when it was asked step {self._step}")
+            told = f"answered step {step} of '{reply.episode}' when it was asked step {self._step}"
+            raise PolicyError(told + ", in another attempt" * (step == self._step))
         return reply
 
 

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Final
+
+from cosim.core.errors import UsageError
 from cosim.episode.driver import Driver, Timer
 from cosim.episode.ports import Manifest
 from cosim.policies.load import load_policy
 from cosim.spec.policy_host import PolicyHost
 from scenarios.serving.isolated import isolated_driver
+
+SCHEME: Final = "zenoh:"
+"""Before the name of a policy that `cosim serve` or `bridge/policy_server.py` serves."""
 
 
 def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expected: Manifest | None = None) -> Driver:
@@ -16,13 +22,27 @@ def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expec
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
+    if name.startswith(SCHEME):
+        from scenarios.serving.remote import remote_driver
+
+        if host.isolated:
+            raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
+        return remote_driver(name, host, timer)
+    if host.servers:
+        raise UsageError(f"--policy-at goes with --policy {SCHEME}NAME, not with '{name}'")
     if host.isolated:
         return isolated_driver(name, timer, expected, host.run)
     return load_policy(name, timer)
 
 
-def known_driver(name: str, host: PolicyHost) -> Driver:
-    """A policy for who wants to know what it is, before a run asks it: one elsewhere is left at once."""
+def known_driver(name: str, host: PolicyHost, jobs: int = 1) -> Driver:
+    """A policy for who wants to know what it is, before a run asks it: one elsewhere is left at once. Raises UsageError
+    when its servers answer for fewer episodes at a time than there are jobs."""
     driver = policy_driver(name, host)
     driver.close()
+    if 0 < driver.at_once < jobs:
+        raise UsageError(
+            f"policy '{name}' answers for {driver.at_once} episodes at a time, and there are {jobs} jobs: serve its "
+            "class in place of an object, more servers, or take fewer jobs"
+        )
     return driver

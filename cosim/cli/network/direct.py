@@ -30,10 +30,10 @@ def direct(
     and comes to the same state hash. A run of other code is refused.
     """
     from bridge.session import open_session
-    from scenarios.execution.directing import behaviours, serve
+    from scenarios.execution.directing import behaviours, direct_all
 
     with open_session(listening("director", "--listen", listen, tls, insecure), warned) as session:
-        serve(session)
+        direct_all(session)
         print(f"directing at {listen}, behaviours {behaviours()}; stop with Ctrl-C", flush=True)
         try:
             while True:

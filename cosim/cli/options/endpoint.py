@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
@@ -12,6 +13,7 @@ from cosim.spec.connection import Connection, Role, checked_endpoint
 
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
+POLICIES_AT = "tcp/127.0.0.1:7449"
 LONGEST_WAIT_S = 240.0
 """For a director: an environment process that says nothing for much longer is taken to hang
 (`scenarios.execution.pool`)."""
@@ -33,12 +35,14 @@ def connecting(role: Role, option: str, endpoint: str, tls: str, insecure: bool)
 
 
 def ends_of_run(
-    live: str | None, director: str | None, tls: str, insecure: bool
-) -> tuple[Connection | None, Connection | None]:
-    """Where a run listens and where its director is: --tls goes to those that are tls/... Raises UsageError."""
-    given = {name: end for name, end in (("--live", live), ("--director", director)) if end is not None}
+    live: str | None, director: str | None, policies: Sequence[str], tls: str, insecure: bool
+) -> tuple[Connection | None, Connection | None, tuple[Connection, ...]]:
+    """Where a run listens, where its director and the servers of its policy are: --tls goes to those that are tls/...
+    Raises UsageError."""
+    at = {f"--policy-at {end}": end for end in policies}
+    given = {name: end for name, end in (("--live", live), ("--director", director)) if end is not None} | at
     if not given and (tls or insecure):
-        raise UsageError(f"{'--tls' if tls else '--insecure'} goes with --live or --director")
+        raise UsageError(f"{'--tls' if tls else '--insecure'} goes with --live, --director or --policy-at")
     guarded = [name for name, end in given.items() if end.startswith("tls/")]
     if tls and not guarded:
         raise UsageError(f"--tls goes with tls/ADDRESS:PORT, not with {', '.join(given.values())}")
@@ -46,6 +50,7 @@ def ends_of_run(
     return (
         None if live is None else listening("coordinator", "--live", live, files["--live"], insecure),
         None if director is None else connecting("coordinator", "--director", director, files["--director"], insecure),
+        tuple(connecting("coordinator", "--policy-at", end, files[name], insecure) for name, end in at.items()),
     )
 
 

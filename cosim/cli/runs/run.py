@@ -40,6 +40,8 @@ _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
 )
 _ISOLATED_HELP = "The policy gets a process of its own and sees observations alone: it cannot reach into the simulator."
+_POLICY_HELP = "A baseline, your own as package.module:Class, or one that is served, as zenoh:NAME."
+_POLICY_AT_HELP = "Where `cosim serve` listens, for --policy zenoh:NAME; may be repeated: servers share the episodes."
 _SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
@@ -52,13 +54,14 @@ _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`)
 
 def carry_out(
     suite: Annotated[str, typer.Argument(help="A suite (see `cosim list`) or the path of a suite's .json file.")],
-    policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    policy: Annotated[str, typer.Option(help=_POLICY_HELP)] = "route",
     robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
     event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
     split: Annotated[str | None, typer.Option(help="Run only scenarios of val, or of test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
+    policy_at: Annotated[list[str] | None, typer.Option(metavar="ENDPOINT", help=_POLICY_AT_HELP)] = None,
     isolated: Annotated[bool, typer.Option("--isolated", help=_ISOLATED_HELP)] = False,
     shared_renderer: Annotated[bool, typer.Option("--shared-renderer", help=_SHARED_HELP)] = False,
     shard: Annotated[str, typer.Option(metavar="I/N", help=_SHARD_HELP)] = "",
@@ -132,8 +135,8 @@ def carry_out(
     from scenarios.serving.drivers import known_driver
 
     asked_latency_ms(latency, real_time)
-    air, away = ends_of_run(live, director, tls, insecure)
-    for line in (line for end in (air, away) if end is not None for line in notices_of(end)):
+    air, away, servers = ends_of_run(live, director, policy_at or (), tls, insecure)
+    for line in (line for end in (air, away, *servers) if end is not None for line in notices_of(end)):
         warned(line)
     if map_name is not None:
         from scenarios.builders.sample import suite_on_map
@@ -160,8 +163,8 @@ def carry_out(
     if part is not None and latency == "measured":
         raise UsageError("--shard with --latency measured: each would measure another: give milliseconds")
     picked = of_run if part is None else part.share(of_run)
-    host = PolicyHost(isolated=isolated, run=token_hex(8))
-    loaded = known_driver(policy, host)
+    host = PolicyHost(isolated=isolated, servers=servers, run=token_hex(8))
+    loaded = known_driver(policy, host, jobs)
     manifest = loaded.manifest
     drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
     asks = shared_renderer and check_shared(loaded, drawn_by)
@@ -263,6 +266,7 @@ def carry_out(
     "`cosim run reactive --policy orca --seed 7 --shard 1/4 --out runs/1`: see `cosim merge`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --isolated`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --on ray://head.lan:10001`, or `--on ray`  \n"
+    "`cosim run long-horizon --policy zenoh:mine --policy-at tcp/127.0.0.1:7449`: see `cosim serve`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"

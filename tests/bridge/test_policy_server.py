@@ -1,0 +1,389 @@
+"""Policies behind Zenoh: questions and answers over real sessions, without an engine of the street."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar
+
+import msgspec
+import numpy as np
+import pytest
+
+from bridge.policy_server import (
+    Answer,
+    AskAct,
+    AskReset,
+    Begun,
+    PolicyDesk,
+    PolicyInfo,
+    Refusal,
+    decode_answered,
+    encode_asked,
+    packed,
+    policy_key,
+    serve,
+)
+from bridge.session import Session, open_session
+from cosim.core.errors import MachineError, PolicyError, PolicyServerLost, UsageError
+from cosim.core.state import Command
+from cosim.episode.given import calibration_of
+from cosim.episode.ports import CameraSpec, Observation
+from cosim.spec.connection import Connection
+from cosim.spec.goal import ImageGoal, PointGoal
+from cosim.spec.odometry import Odometry
+from cosim.spec.policy_host import PolicyHost
+from cosim.spec.robot import COURIER
+from scenarios.serving import remote
+from scenarios.serving.drivers import known_driver
+from scenarios.serving.remote import RemoteDriver, remote_driver
+from tests.conftest import PATIENCE_S
+
+SPEC = CameraSpec(64, 40)
+RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
+
+
+class Counting:
+    """Its speed is the number of the question in its episode, in tenths; in some it does what they are called."""
+
+    manifest: ClassVar = {
+        "name": "counting", "rate_hz": 4.0, "camera": {"width": 64, "height": 40}, "goal": "image",
+    }  # fmt: skip
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.count = 0
+
+    def act(self, seen: Any) -> Any:
+        self.count += 1
+        self.asked.append(seen.episode)
+        self.seen = seen
+        if seen.episode == "raises":
+            raise KeyError("no such weight")
+        if seen.episode == "nan":
+            return {"v_mps": float("nan"), "w_radps": 0.0}
+        if seen.episode == "words":
+            return "left"
+        if seen.episode == "slow":
+            time.sleep(0.6)
+        return {"v_mps": self.count / 10.0, "w_radps": 0.0}
+
+
+class Together(Counting):
+    """The same for many episodes at once; notes how many it was asked for."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.counts: dict[str, int] = {}
+        self.batches: list[int] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.counts[episode_id] = 0
+
+    def ended(self, episode_id: str) -> None:
+        del self.counts[episode_id]
+
+    def act_batch(self, observations: Any) -> Any:
+        self.batches.append(len(observations))
+        for one in observations:
+            self.counts[one.episode] += 1
+        return [np.full((3, 2), [self.counts[one.episode] / 40.0, 0.0]) for one in observations]
+
+
+def seen_at(tick: int, episode: str = "k1") -> Observation:
+    return Observation(
+        tick, tick / 20.0, RGB, 0.5, 0.0, COURIER, episode=episode, goal=ImageGoal(RGB),
+        odometry=Odometry(1.0, 2.0, None), camera=calibration_of(SPEC, COURIER),
+    )  # fmt: skip
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[Connection]:
+    """Where servers and runs meet."""
+    with open_session(Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")) as session:
+        yield session.inside
+
+
+@contextmanager
+def served(at: Connection, policy: Any, name: str = "counting", **more: Any) -> Iterator[None]:
+    """A policy served by a thread of this process, until the block ends."""
+    session = open_session(at)
+    heard: list[Any] = []
+
+    class Ending:
+        """The session, whose end ends the serving thread, too."""
+
+        def declare_queryable(self, key: str, handler: Callable[[Any], None], complete: bool) -> Any:
+            heard.append(handler)
+            return session.itself.declare_queryable(key, handler, complete=complete)
+
+    def run() -> None:
+        with pytest.raises(AttributeError):
+            serve(policy, name=name, session=Ending(), **more)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        wait_until(lambda: len(heard) == 4)
+        yield
+    finally:
+        heard[1](None)  # no query: the end
+        thread.join(PATIENCE_S)
+        session.close()
+
+
+def wait_until(what: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + PATIENCE_S
+    while not what():
+        assert time.monotonic() < until_s
+        time.sleep(0.01)
+
+
+@contextmanager
+def driver_at(at: Connection, name: str = "counting", run: str = "run1") -> Iterator[RemoteDriver]:
+    driver = remote_driver(f"zenoh:{name}", PolicyHost(servers=(at,), run=run))
+    try:
+        yield driver
+    finally:
+        driver.close()
+
+
+@pytest.mark.engine
+def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
+    """It is given the picture, goal and calibration to the bit; what it raises or answers wrongly is its crash, in the
+    words of one in this process; and how long it took is told."""
+    policy = Counting()
+    with served(hub, policy), driver_at(hub) as driver:
+        assert (driver.runs, driver.manifest.camera, driver.at_once) == ("remote", SPEC, 1)
+        driver.reset("k1", 7)
+        assert [driver.act(seen_at(tick)) for tick in (0, 5)] == [Command(0.1, 0.0), Command(0.2, 0.0)]
+        assert (
+            (policy.seen.rgb == RGB).all() and (policy.seen.goal.rgb == RGB).all() and policy.seen.rgb.flags.writeable
+        )
+        assert (policy.seen.camera.on_robot == calibration_of(SPEC, COURIER).on_robot).all()
+        assert policy.seen.odometry.heading_rad is None and policy.seen.robot.v_max_mps == COURIER.v_max_mps
+        assert driver.clock.keys() == {"answer_median_ms", "answer_p95_ms"}
+        told = {
+            "raises": "policy 'counting' raised KeyError: 'no such weight' .act at 0.25 s.",
+            "nan": "answered Command.v_mps=nan, w_radps=0.0.: both must be finite",
+            "words": "answered 'left': neither a Command nor waypoints",
+        }
+        driver.ended()
+        for name, words in told.items():
+            driver.reset(name, 7)
+            with pytest.raises(PolicyError, match=words):
+                driver.act(seen_at(5, name))
+            driver.ended()
+
+
+@pytest.mark.engine
+def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(
+    hub: Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An answer that comes after the question was given up is had by asking the same step again: the policy is asked
+    once."""
+    policy = Counting()
+    monkeypatch.setattr(remote, "_TRY_S", 0.2)
+    with served(hub, policy), driver_at(hub) as driver:
+        driver.reset("slow", 7)
+        assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [Command(0.1, 0.0), Command(0.2, 0.0)]
+    assert policy.asked == ["slow", "slow"]
+
+
+@pytest.mark.engine
+def test_several_episodes_at_once_are_answered_together(hub: Connection) -> None:
+    """Eight environments ask one policy with act_batch: each gets the answers of its own episode, some were asked
+    together, and nothing is remembered of those that have ended."""
+    policy = Together()
+
+    def drive(name: str, came: list[float]) -> None:
+        with driver_at(hub, "together", run=name) as driver:
+            driver.reset(name, 1)
+            came += [driver.act(seen_at(tick, name)).v_mps for tick in range(6)]
+            driver.ended()
+
+    came: list[list[float]] = [[] for _ in range(8)]
+    with served(hub, policy, "together"):
+        threads = [threading.Thread(target=drive, args=(f"k{i}", came[i])) for i in range(8)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join(PATIENCE_S)
+    assert all(speeds == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]) for speeds in came)
+    assert sum(policy.batches) == 48 and max(policy.batches) > 1 and not policy.counts
+
+
+@pytest.mark.engine
+def test_servers_of_one_name_share_the_episodes_and_each_keeps_its_own(hub: Connection) -> None:
+    """Of two, the one with less to do takes the next episode; runs of the same seed are kept apart; one that is of
+    another policy is refused."""
+    one, other = Together(), Together()
+    with served(hub, one, "together"):
+        with served(hub, other, "together"), driver_at(hub, "together") as a, driver_at(hub, "together", "run2") as b:
+            for driver in (a, b):
+                driver.reset("k1", 1)
+                driver.act(seen_at(0))
+            assert (len(one.batches), len(other.batches)) == (1, 1)
+            for driver in (a, b):
+                driver.ended()
+        with served(hub, Counting(), "together"), pytest.raises(UsageError, match="are of two policies"):
+            remote_driver("zenoh:together", PolicyHost(servers=(hub,)))
+
+
+@pytest.mark.engine
+def test_a_server_begun_anew_has_lost_the_episode(hub: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether it is gone or another has taken its place, nobody answers in the middle of an episode for it: it is lost,
+    and begun again it is whole."""
+    monkeypatch.setattr(remote, "_LOST_AFTER_S", 0.3)
+    with driver_after(hub) as driver:
+        with served(hub, Counting()):
+            driver.reset("k1", 7)
+            driver.act(seen_at(0))
+        with pytest.raises(PolicyServerLost, match="is gone"):
+            driver.act(seen_at(5))
+        with served(hub, Counting()):
+            with pytest.raises(PolicyServerLost, match="is gone"):
+                driver.act(seen_at(5))
+            driver.reset("k1", 7)
+            assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+
+
+@contextmanager
+def driver_after(hub: Connection) -> Iterator[RemoteDriver]:
+    """A driver that has seen a server, which is gone again."""
+    with served(hub, Counting()):
+        driver = remote_driver("zenoh:counting", PolicyHost(servers=(hub,), run="run1"))
+    try:
+        yield driver
+    finally:
+        driver.close()
+
+
+@pytest.mark.engine
+def test_a_server_that_answers_wrongly_is_a_policy_that_crashed(hub: Connection) -> None:
+    """Garbage, another step, another attempt, another kind of answer: in words, and never taken for an answer."""
+    wrong: dict[str, Callable[[AskAct], bytes]] = {
+        "sent what is no answer": lambda one: b"\xc1 no message",
+        "answered step 7 of 'k1' when it was asked step 0": lambda one: answer_to(one, step=7),
+        "answered step 0 of 'k1' when it was asked step 0, in another attempt": lambda one: answer_to(one, attempt="0"),
+        "told who it is when it was asked something else": lambda one: encode_asked(PolicyInfo("s", "wrong", {})),
+        "answered step -1 of 'k1' when it was asked step 0": begin,
+    }
+    for words, answer in wrong.items():
+        with liar(hub, answer), driver_at(hub, "wrong") as driver:
+            driver.reset("k1", 7)
+            with pytest.raises(PolicyError, match=f"policy 'wrong' {words}"):
+                driver.act(seen_at(0))
+
+
+def answer_to(one: AskAct, **other: Any) -> bytes:
+    return encode_asked(msgspec.structs.replace(Answer(*one.signature, one.step, 1.0, 0.0), **other))
+
+
+def begin(one: AskAct | AskReset) -> bytes:
+    return encode_asked(Begun(*one.signature))
+
+
+@contextmanager
+def liar(hub: Connection, answer: Callable[[AskAct], bytes]) -> Iterator[Session]:
+    """A server that begins as it should, and answers as it likes."""
+    info = PolicyInfo("s", "wrong", {"name": "wrong"})
+    below = policy_key("default", "wrong", "s")
+    with open_session(hub) as session:
+        session.serve(f"{below}/info", lambda _: encode_asked(info), found=True)
+        session.serve(f"{below}/reset", lambda asked: begin(msgspec.msgpack.decode(asked, type=AskReset)))
+        session.serve(f"{below}/act", lambda asked: answer(msgspec.msgpack.decode(asked, type=AskAct)))
+        yield session
+
+
+@pytest.mark.engine
+def test_what_a_stranger_sends_is_refused_and_changes_nothing(hub: Connection) -> None:
+    """Garbage, depth without end, an episode that did not begin, a question to everybody: refused; a run goes on."""
+    policy = Counting()
+    with served(hub, policy), driver_at(hub) as driver, open_session(hub) as stranger:
+        driver.reset("k1", 7)
+        (key,) = stranger.answers(f"{policy_key('default', 'counting', '*')}/info", timeout_s=PATIENCE_S)
+        key = key.removesuffix("info") + "act"
+        sign = ("other", "k9", "a")
+        for payload in (
+            b"", b"\xdf\xff\xff\xff\xff", b"\x91" * 100_000, encode_asked(AskAct(*sign, 0, 0, 0.0, 0.0, 0.0)),
+        ):  # fmt: skip
+            heard = stranger.ask_once(key, payload, timeout_s=PATIENCE_S)
+            assert heard.how == "refused" and isinstance(decode_answered(heard.payload), Refusal)
+        everybody = key.rpartition("/")[0].rpartition("/")[0] + "/**"
+        assert stranger.ask_once(everybody, b"", timeout_s=PATIENCE_S).how in ("refused", "answered")
+        assert driver.act(seen_at(0)) == Command(0.1, 0.0) and policy.asked == ["k1"]
+
+
+@pytest.mark.engine
+def test_pictures_come_as_jpeg_to_who_asks_for_that(hub: Connection) -> None:
+    """Nearly the same pixels, and every row will say so."""
+    policy = Counting()
+    smooth = np.tile(np.linspace(0, 255, 64, dtype=np.uint8)[None, :, None], (40, 1, 3))
+    with served(hub, policy, jpeg=True), driver_at(hub) as driver:
+        driver.reset("k1", 7)
+        driver.act(Observation(0, 0.0, smooth, 0.0, 0.0, COURIER, goal=PointGoal(1.0, 2.0)))
+        assert driver.runs == "remote, jpeg" and policy.seen.goal.x_m == 1.0
+        assert np.abs(policy.seen.rgb.astype(int) - smooth).max() < 12 and not (policy.seen.rgb == smooth).all()
+
+
+@pytest.mark.engine
+def test_a_policy_that_is_not_served_or_not_enough_is_said(hub: Connection, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nobody there, no endpoint, one that knows everything, too many jobs for an object: before anything is started."""
+    monkeypatch.setattr(remote, "_FIRST_FOUND_WITHIN_S", 0.2)
+    at = PolicyHost(servers=(hub,))
+    with pytest.raises(MachineError, match="no server of policy 'counting' at unixsock"):
+        known_driver("zenoh:counting", at)
+    with pytest.raises(UsageError, match="needs --policy-at ENDPOINT"):
+        known_driver("zenoh:counting", PolicyHost())
+    with pytest.raises(UsageError, match="--policy-at goes with --policy zenoh:NAME, not with 'route'"):
+        known_driver("route", at)
+    with (
+        served(hub, Counting()),
+        pytest.raises(UsageError, match="answers for 1 episodes at a time, and there are 4 jobs"),
+    ):
+        known_driver("zenoh:counting", at, 4)
+    knows = Counting.manifest | {"privileged": True}
+    with served(hub, Counting(), told=knows), pytest.raises(UsageError, match="a remote one sees only observations"):
+        known_driver("zenoh:counting", at)
+    large = Counting.manifest | {"camera": {"width": 2000, "height": 2000}}
+    with served(hub, Counting(), told=large), pytest.raises(UsageError, match="MiB of pictures a step"):
+        known_driver("zenoh:counting", at)
+
+
+def test_a_server_beyond_this_machine_is_guarded_or_insecure_in_so_many_words() -> None:
+    """`serve` refuses it, and no endpoint, and two, and a name that cannot stand in a key."""
+    with pytest.raises(ValueError, match="is beyond this machine and unguarded: whoever can reach it may ask"):
+        serve(Counting(), listen="tcp/0.0.0.0:7449")
+    for ends in ({}, {"listen": "tcp/127.0.0.1:1", "connect": "tcp/127.0.0.1:1"}, {"listen": "udp/127.0.0.1:1"}):
+        with pytest.raises(ValueError, match="listen or connect, one of both"):
+            serve(Counting(), **ends)
+    with pytest.raises(ValueError, match="cannot stand in a key"):
+        serve(Counting(), name="a/**", listen="tcp/127.0.0.1:1")
+
+
+def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> None:
+    """The second episode finds an object busy; of a class there is an object for each, and it is used again."""
+    made: list[Counting] = []
+
+    class Made(Counting):
+        def __init__(self) -> None:
+            super().__init__()
+            made.append(self)
+
+    def begun(desk: PolicyDesk, episode: str) -> str:
+        (reply,) = desk.answers([encode_asked(AskReset("r", episode, "a", 1))])
+        told = decode_answered(reply)
+        return told.why if isinstance(told, Refusal) else "begun"
+
+    one, many = PolicyDesk(Counting()), PolicyDesk(Made)
+    assert [begun(one, name) for name in ("k1", "k1", "k2")] == ["begun", "begun", "busy"]
+    assert [begun(many, name) for name in ("k1", "k2")] == ["begun", "begun"] and len(made) == 2
+    act = AskAct("r", "k2", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": packed(RGB)})
+    first, again, later = (decode_answered(one) for one in many.answers([encode_asked(act)] * 3))
+    assert first == again == later and len(made[1].asked) == 1
