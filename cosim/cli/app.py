@@ -44,7 +44,10 @@ app = typer.Typer(
     rich_markup_mode="markdown",
     pretty_exceptions_enable=False,
     help="Sidewalk-navigation benchmark: SUMO crowds, a PyBullet robot, Zenoh between them.",
-    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`",
+    epilog="Examples:  \n`cosim run long-horizon --policy route --episodes 2`  \n`cosim COMMAND --help`\n\n"
+    "Exit codes: 0 done, of a run: all is scored; 1 ended, but not all is scored, or a check has failed; 2 wrong use "
+    "or bad input; 3 the machine or an engine; 130 interrupted, by Ctrl-C or SIGTERM: what is finished is kept; 141 "
+    "nobody read what it printed.",
 )
 for commands in (
     *(run_app, list_app, show_app, installation_app),

@@ -15,11 +15,14 @@ import time
 from collections import Counter, deque
 from collections.abc import Sequence
 from functools import partial
+from logging import ERROR, WARNING
+from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
 
 from cosim.core.errors import MachineError, RunError, UsageError
+from cosim.core.journal import happened
 from cosim.episode.given import with_goal
 from cosim.records.record import Record, Status, begun
 from cosim.records.run_folder import RunFolder
@@ -64,6 +67,7 @@ def run_all(
     pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
     waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
     attempts: Counter[tuple[str, bool]] = Counter()
+    happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
         while waiting or pool.busy:
             while waiting and transport.room(len(pool.busy)) > 0:
@@ -72,6 +76,8 @@ def run_all(
                 so_far, most = (lost.scenario.id, lost.away), LOSSES if lost.away else ATTEMPTS
                 attempts[so_far] += bool(lost.why)
                 if attempts[so_far] < most:
+                    tried = attempts[so_far]
+                    happened("retried", WARNING, scenario=lost.scenario.id, why=lost.why, attempts=tried, of=most)
                     waiting.appendleft(lost.scenario)
                 else:
                     why = f"{lost.why}, {most} times; see logs/ in the run folder"
@@ -182,6 +188,7 @@ class _Pool:
         idle = next((w for w in self._workers if w.job is None), None) or self._start()
         idle.job, idle.heard_at, idle.silent = scenario, time.monotonic(), True
         self._folder.forget(scenario.id)
+        happened("claimed", scenario=scenario.id, worker=Path(idle.worker.log).stem)
         idle.worker.give(Job(scenario, self._options))
 
     def listen(self) -> list[_Lost]:
@@ -266,6 +273,8 @@ class _Pool:
         self, one: _Slot, why: str, *, began: bool = True, in_engine: bool = False, away: bool = False
     ) -> list[_Lost]:
         """A worker has ended. Returns its scenario if that is not done, and why, if it was begun."""
+        if one.job is not None:
+            happened("lost", WARNING, worker=Path(one.worker.log).stem, scenario=one.job.id, why=why)
         self._workers.remove(one)
         if one.job is None:
             return []
@@ -295,6 +304,7 @@ class _Pool:
 
     def give_up(self, scenario: Scenario, reason: str, status: Status = "crashed") -> None:
         """Record a scenario that does not come to its end: no worker survives it, or the policy does not answer."""
+        happened("given up", ERROR, scenario=scenario.id, why=reason, status=status)
         spec = self._folder.spec
         manifest = with_goal(self._hello.manifest, self._options.goal)
         record = begun(
@@ -305,6 +315,7 @@ class _Pool:
         self._over(scenario, status)
 
     def _over(self, scenario: Scenario, status: Status) -> None:
+        happened("done", scenario=scenario.id, status=status)
         if self._renderer is not None:
             self._renderer.episode_ended()
         self._tell(Done(scenario.id, status))

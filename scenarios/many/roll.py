@@ -7,12 +7,14 @@ import time
 from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from logging import DEBUG, WARNING
 from pathlib import Path
 from typing import Final, Literal
 
 import msgspec
 
 from cosim.core.errors import EngineError
+from cosim.core.journal import happened
 from cosim.records.run_folder import RunFolder
 from cosim.spec.scenario import Scenario
 from scenarios.execution.messages import Compares, Done, Hear, Message, Progress, Waits
@@ -180,6 +182,7 @@ class Roll:
         one = self._of(worker, host)
         if (one.state, one.why) != ("turned away", why):
             self.note(f"{worker}: turned away: {why}")
+            happened("refused", WARNING, worker=worker, host=host, why=why)
         one.state, one.why = "turned away", why
 
     def conflict(self, words: str) -> None:
@@ -193,6 +196,7 @@ class Roll:
 
     def note(self, words: str) -> str:
         """Keep a line in the run's log. Returns it."""
+        happened("noted", DEBUG, words=words)
         line = f"{datetime.now(UTC).strftime('%Y-%m-%d %H:%M:%S')} {' '.join(words.split())}"
         with suppress(OSError), (self._held.path / LOG_FILE).open("a") as log:  # a full disk is told elsewhere
             log.write(line + "\n")

@@ -7,11 +7,13 @@ one.
 from __future__ import annotations
 
 import time
+from logging import WARNING
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
 from bridge.codec import encode
 from cosim.core.errors import MachineError, UsageError
+from cosim.core.journal import happened
 from cosim.spec.scenario import CityMap
 from scenarios.execution.asked import Question
 from scenarios.execution.messages import (
@@ -158,6 +160,8 @@ class WorkSlot:
             case Over() if not self._done:
                 raise RunEnded
             case Received() if act == "result":
+                if self._done is not None:
+                    happened("done", scenario=self._done.scenario, status=self._done.status, how=reply.how)
                 self._done = None
             case _:
                 pass
@@ -220,6 +224,7 @@ class WorkSlot:
         self._give()
 
     def _begin(self, lease: Lease) -> None:
+        happened("claimed", scenario=lease.job.scenario.id, slot=self._number, lease=lease.number)
         self._lease, self._job, self._silent = lease.number, lease.job, True
         self._renew_s = time.monotonic() + RENEW_S
         where = lease.job.scenario.place
@@ -329,6 +334,7 @@ class WorkSlot:
 
     def _fail(self, how: How, why: str, *, in_engine: bool = False, asks: Asks | None = None) -> None:
         assert self._job is not None
+        happened("handed back" if how == "released" else "failed", WARNING, scenario=self._job.scenario.id, why=why)
         failure = NoResult(
             worker=self._worker, slot=self._number, lease=self._lease, scenario=self._job.scenario.id, how=how,
             why=why[:_MOST_WORDS], in_engine=in_engine, asks=asks, printed=self._printed(),

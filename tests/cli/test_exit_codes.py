@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from cosim.cli.app import main
 from cosim.core import errors
 from cosim.core.errors import CosimError
+from tests.conftest import Cosim
 
 CODES = {
     "UsageError": 2, "SpecError": 2, "MapError": 2, "RunError": 2, "AccessError": 2, "PolicyError": 1, "EngineError": 3,
@@ -107,3 +109,11 @@ def test_the_readme_tells_the_exit_codes() -> None:
         errors.UNREAD,
     ):
         assert f"\n| {code} |" in readme
+
+
+def test_the_help_tells_the_exit_codes(cosim: Cosim) -> None:
+    """`cosim --help` names every code of the README's table."""
+    readme = (Path(__file__).parents[2] / "README.md").read_text()
+    codes = [line.split("|")[1].strip() for line in readme.splitlines() if re.match(r"\| \d+ \|", line)]
+    told = " ".join(cosim("--help").stdout.split()).partition("Exit codes: ")[2]
+    assert len(codes) == 6 and re.findall(r"(?:^|; )(\d+) ", told) == codes

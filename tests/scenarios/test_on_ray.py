@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 import threading
 import time
@@ -87,12 +88,18 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     killer = threading.Thread(target=kill_one, daemon=True)
     killer.start()
     words = ("run", "four.json", "--policy", "only_here:Waits", "--seed", "3", "--out")
-    said = cosim(*words, "ray", "--on", "ray", cwd=tmp_path)
+    said = cosim(*words, "ray", "--on", "ray", "--log-json", "log.jsonl", cwd=tmp_path)
     assert "2 workers on Ray" in said.stderr and said.returncode == 0, said
     killer.join(PATIENCE_S)
     assert len([*go.parent.glob("begun-*")]) > SCENARIOS, "the episode of the node that died was not run again"
     assert cosim(*words, "here", cwd=tmp_path).returncode == 0
     assert (tmp_path / "ray/results.csv").read_bytes() == (tmp_path / "here/results.csv").read_bytes()
+
+    events = [json.loads(line)["event"] for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert (events[0], events[-1], events.count("done")) == ("run begun", "run over", SCENARIOS)
+    assert events.count("lost") == events.count("retried") == 1
+    (figures,) = json.loads((tmp_path / "ray/figures.json").read_text())
+    assert (figures["episodes"], figures["retried"], figures["simulated_s"]) == (SCENARIOS, 1, SCENARIOS * 2.0)
 
     spec = read_spec(tmp_path / "ray")
     others = msgspec.structs.replace(spec, versions=spec.versions | {"numpy": "0.1"})

@@ -16,7 +16,9 @@ from cosim.cli.options.panels import MANY
 from cosim.cli.options.taking import taking
 from cosim.cli.runs.run import ReachesWorkers, carry_out
 from cosim.cli.terminal.consoles import err
+from cosim.cli.terminal.logs import LogJson, LogLevel, logged
 from cosim.core.errors import INTERRUPTED
+from cosim.core.journal import happened
 
 coordinator_app = typer.Typer()
 
@@ -76,6 +78,8 @@ def worker_command(
     logs: Annotated[
         Path | None, typer.Option(help="Keep here what its processes print; else the run alone keeps it.")
     ] = None,
+    log_level: LogLevel = "",
+    log_json: LogJson = None,
 ) -> None:
     """Run episodes for a coordinator (`cosim coordinator`), on this machine or another one.
 
@@ -85,9 +89,12 @@ def worker_command(
     from scenarios.many.supervisor import work
 
     connection = connecting("worker", "--connect", connect, tls, insecure)
-    if work(connection, jobs, _say, once=once, logs=logs) == SIGINT:
+    with logged(log_level, log_json):
+        ended_by = work(connection, jobs, _say, once=once, logs=logs)
+    if ended_by == SIGINT:
         raise typer.Exit(INTERRUPTED)
 
 
 def _say(words: str) -> None:
+    happened("said", words=words)
     err.print(words, soft_wrap=True, highlight=False, markup=False)

@@ -30,6 +30,7 @@ from cosim.cli.options.street import (
 from cosim.cli.options.taking import taking
 from cosim.cli.terminal.board import Board
 from cosim.cli.terminal.consoles import err, out
+from cosim.cli.terminal.logs import LogJson, LogLevel, logged
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
@@ -106,6 +107,8 @@ def carry_out(
     counterfactual: Annotated[
         bool, typer.Option("--counterfactual", help="Simulate every street again without the robot: whom it delayed.")
     ] = False,
+    log_level: LogLevel = "",
+    log_json: LogJson = None,
     carrier: AbstractContextManager[ReachesWorkers] | None = None,
 ) -> None:
     """Do what is asked by the options of `cosim run`. carrier: what reaches the workers, in place of processes of this
@@ -114,6 +117,7 @@ def carry_out(
     from bridge import keys
     from bridge.session import notices_of, open_session
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
+    from cosim.records.figures import Going
     from cosim.records.run_folder import RunFolder
     from cosim.records.run_spec import Shard
     from cosim.spec.goal import goal_called
@@ -197,6 +201,7 @@ def carry_out(
     check_alone(options, jobs, shared_renderer)
     spec = run_spec(whole, of_run, policy, loaded, options, shared_renderer, part)
     with ExitStack() as stack:
+        counts = stack.enter_context(logged(log_level, log_json))
         carried = None if carrier is None else stack.enter_context(carrier)
         if on_air is not None:
             hub = stack.enter_context(open_session(on_air.connection))
@@ -224,8 +229,10 @@ def carry_out(
             drawing = SharedRenderer(held.path / "logs", hello, asks=asks, patience=patience)
             renderer = stack.enter_context(drawing)
         transport: Transport = LocalProcesses(held.path / "logs", jobs)
+        go = Going(held.path, [s.id for s in todo], counts)
         try:
             with ExitStack() as running:
+                running.callback(go.end)
                 tell: Hear = board.tell
                 if carried is None:
                     running.enter_context(remembered(held, todo, jobs))
@@ -243,6 +250,8 @@ def carry_out(
         table = held.finish()
     print_table(out, table, len(of_run))
     print_by_kind(out, table, kinds_of(path))
+    if go.figures is not None:
+        err.print(go.figures.in_words, soft_wrap=True, highlight=False)
     out.print(f"Run folder: {path}", soft_wrap=True)
     if part is not None:
         err.print(f"Shard {part.in_words} of the run: `cosim merge` makes one of all.", highlight=False)
