@@ -106,6 +106,16 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
     return rounded
 
 
+def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
+    """(N,) who goes from `before` to `after`, (N, 2) metres each, nearer to the robot's outline than one steps round
+    it."""
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    turn, half = np.array([[cos, -sin], [sin, cos]]), np.array(body.half_m)
+    gap = _gap((after - body.pose.xy) @ turn, -half, half)
+    near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (gap < _gap((before - body.pose.xy) @ turn, -half, half))
+    return near
+
+
 def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
     """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
     cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)

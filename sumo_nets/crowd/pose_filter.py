@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from cosim.core.geometry import Floats, wrap_angles
 from cosim.core.rows import RowLookup
 from cosim.people.standing import Standing
-from cosim.people.yielding import RobotBody, stepped_round
+from cosim.people.yielding import RobotBody, comes_too_near, stepped_round
 from sumo_nets.crowd.separation import NearPairs, kept_apart
 
 MAX_SPEED_MPS = 2.2
@@ -79,9 +79,7 @@ class PoseFilter:
         shown = before + gap * (reach_m / np.maximum(distance, reach_m))[:, None]
         stand = speed < PERSON_STANDS_MPS
         shown = self._apart(before, shown, others, stand)
-        if body is not None:
-            shown = stepped_round(before, shown, body, stand)
-        shown = self.standing.stepped_round(before, shown, stand)
+        shown = self._round(before, shown, body, stand)
         velocity = (shown - before) / self.period_s
         velocity[new] = simulated
         motion = motion + (velocity - motion) * min(self.period_s / LOOK_AHEAD_S, 1.0)
@@ -95,6 +93,15 @@ class PoseFilter:
         if ids:
             self._xy, self._heading, self._motion = shown, facing, motion
         return shown, facing, np.hypot(velocity[:, 0], velocity[:, 1])
+
+    def _round(self, before: Floats, shown: Floats, body: RobotBody | None, stand: NDArray[np.bool_]) -> Floats:
+        """Round the robot and what stands; who would step round that into the robot stays where it is."""
+        if body is None:
+            return self.standing.stepped_round(before, shown, stand)
+        past = stepped_round(before, shown, body, stand)
+        round_both = self.standing.stepped_round(before, past, stand)
+        stays = (round_both != past).any(axis=1) & comes_too_near(before, round_both, body)
+        return np.where(stays[:, None], before, round_both)
 
     def _apart(self, before: Floats, shown: Floats, others: Floats, stand: NDArray[np.bool_]) -> Floats:
         firm = np.arange(len(shown) + len(others)) >= len(shown)

@@ -8,7 +8,11 @@ import math
 import numpy as np
 import pytest
 
-from cosim.core.geometry import Floats, wrap_angle
+from cosim.core.geometry import Floats, Pose, box_disk_gap, wrap_angle
+from cosim.core.state import PERSON_RADIUS_M
+from cosim.people.standing import Standing
+from cosim.people.yielding import RobotBody
+from cosim.spec.events import StandingBody
 from sumo_nets.crowd.pose_filter import MAX_SPEED_MPS, MAX_TURN_RADPS, PoseFilter
 
 DT_S = 0.05
@@ -82,3 +86,19 @@ def test_people_come_and_go() -> None:
     assert [len(part) for part in empty] == [0, 0, 0]
     xy, _, _ = poses.update(("b",), ab[:1], np.zeros(1), east)
     assert xy[0] == pytest.approx(ab[0])
+
+
+@pytest.mark.parametrize("aside_m", [0.3, 0.6, 0.8, 1.0], ids=["close", "near", "middle", "apart"])
+def test_nobody_steps_round_what_stands_into_the_robot(aside_m: float) -> None:
+    """Who hurries past a thing that stands, with the robot driving beside it, comes no nearer to the robot for it."""
+    half_m = 0.35, 0.275
+    standing = Standing([StandingBody(0.0, -aside_m, 0.0, 1.0, 0.6, 0.0, -1.0)])
+    poses = PoseFilter(DT_S, standing)
+    track = walk(3.0, MAX_SPEED_MPS) - [3.0, aside_m - 0.1]
+    least_m = math.inf
+    for i in range(len(track)):
+        robot = Pose(-2.4 + 1.2 * i * DT_S, 0.45, 0.0)
+        body = RobotBody(robot, half_m, 1.2)
+        xy, _, _ = poses.update(("c1",), track[i : i + 1], np.full(1, MAX_SPEED_MPS), east, body)
+        least_m = min(least_m, float(box_disk_gap(np.array([robot]), *half_m, xy[None])[0, 0]) - PERSON_RADIUS_M)
+    assert least_m > 0.05
