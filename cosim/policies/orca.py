@@ -34,7 +34,7 @@ from cosim.policies.encounters import Yielding, bodies, gaps_to_people, walks
 from cosim.policies.foresight import STEP_S, STEP_TIMES_S, STEPS, Ahead, Plans, Way, foresee
 from cosim.policies.groups import distances, lines, who_stands
 from cosim.policies.guide import Guide
-from cosim.policies.route import CAR_BRAKE_MPS2, SEEN_M, car_disks, crossing_limit
+from cosim.policies.route import CAR_BRAKE_MPS2, SEEN_M, STOP_SHORT_M, car_disks, crossing_limit
 from cosim.spec.robot import Robot
 
 LANES_M: Final = np.arange(-8, 9) * 0.25
@@ -78,6 +78,9 @@ NEAR_S: Final = 1.2
 """A plan is compared with ORCA's velocity over so long."""
 LANE_AHEAD_M: Final = np.arange(0.5, 9.1, 0.5)
 LANE_SLOPE: Final = 0.4
+
+_STANDS_AT_WALK_S: Final = 6.0
+"""Who comes too late to cross at green rolls up to the crossing, to stand there for so long before it is red."""
 
 STOP_BEFORE_M: Final = 2.0
 STOP_BRAKE_MPS2: Final = 0.5
@@ -131,7 +134,7 @@ class Orca:
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
         robot = observation.robot
-        limit_mps = min(crossing_limit(known, robot), stop_limit(known), speeds_of(robot)[0])
+        limit_mps = min(crossing_limit(known, robot), unhurried(known, robot), stop_limit(known), speeds_of(robot)[0])
         if self._yielding.waits(known, observation.time_s):
             limit_mps = 0.0
         x_m, y_m, _ = known.robot.pose
@@ -214,6 +217,19 @@ def nearby(known: Privileged) -> People:
     behind = (forward < -0.3) & ((np.abs(left) < 0.6) | (forward < -2.5))
     near = (np.hypot(offset[:, 0], offset[:, 1]) < 1.5 * SEEN_M) & ~behind
     return people.only(np.flatnonzero(near))
+
+
+def unhurried(known: Privileged, robot: Robot) -> float:
+    """Speed in m/s at which the robot comes up to a crossing not long before its signal turns red, if it is near and
+    the green that is left is too short."""
+    for crossing_id, enter_s_m, _ in known.crossings:
+        room_m = enter_s_m - known.route_s_m - (robot.length_m / 2 + STOP_SHORT_M)
+        signal = known.signals.get(crossing_id)
+        if not 0.0 < room_m < 8.0 or signal is None or not signal.walk or signal.changes_in_s is None:
+            continue
+        if math.isfinite(crossing_limit(known, robot)) and signal.changes_in_s > _STANDS_AT_WALK_S:
+            return room_m / (signal.changes_in_s - _STANDS_AT_WALK_S)
+    return math.inf
 
 
 def stop_limit(known: Privileged) -> float:
