@@ -25,7 +25,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from cosim.core.geometry import Floats, Polyline, wrap_angles
-from cosim.core.state import PERSON_RADIUS_M, Command, People
+from cosim.core.state import DIRECTED, PERSON_RADIUS_M, Command, People
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.people.orca import best_velocity, half_plane
 from cosim.policies.body import BodyDisks
@@ -81,6 +81,12 @@ LANE_SLOPE: Final = 0.4
 
 _STANDS_AT_WALK_S: Final = 6.0
 """Who comes too late to cross at green rolls up to the crossing, to stand there for so long before it is red."""
+
+_REACTS_S: Final = 0.25
+_AHEAD: Final = 0.3
+_CREEPS_MPS: Final = 0.15
+"""In a throng it drives so fast that it comes to rest, after a moment, before whom it drives at; never slower than
+this."""
 
 STOP_BEFORE_M: Final = 2.0
 STOP_BRAKE_MPS2: Final = 0.5
@@ -142,6 +148,7 @@ class Orca:
         if limit_mps < 0.1 or math.dist((x_m, y_m), self._stuck_at) > STUCK_M:
             self._stuck_s, self._stuck_at, self._led_anew_s = 0.0, (x_m, y_m), _LED_ANEW_S
 
+        limit_mps = min(limit_mps, pressed_limit(known, robot))
         people = nearby(known)
         ends = lines(people)
         here = self._find(known, ends)
@@ -230,6 +237,25 @@ def unhurried(known: Privileged, robot: Robot) -> float:
         if math.isfinite(crossing_limit(known, robot)) and signal.changes_in_s > _STANDS_AT_WALK_S:
             return room_m / (signal.changes_in_s - _STANDS_AT_WALK_S)
     return math.inf
+
+
+def pressed_limit(known: Privileged, robot: Robot) -> float:
+    """Speed in m/s at which the robot comes to rest before anybody of the crowd ahead, wherever they turn."""
+    pose, people = known.robot.pose, known.people
+    offset = (people.xy - pose.xy)[~people.are(*DIRECTED)]
+    cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
+    local = offset @ np.array([[cos, -sin], [sin, cos]])
+    half = np.array(robot.footprint_m) / 2
+    away = local - np.clip(local, -half, half)
+    far = np.hypot(away[:, 0], away[:, 1])
+    ahead = away[:, 0] / np.maximum(far, 1e-9)
+    rows = ahead > _AHEAD
+    if not rows.any():
+        return math.inf
+    room_m, brake_mps2 = np.maximum(far[rows] - PERSON_RADIUS_M, 0.0), 0.8 * robot.acceleration_mps2
+    reacted_mps = _REACTS_S * brake_mps2
+    speed = (np.sqrt(reacted_mps**2 + 2.0 * brake_mps2 * room_m) - reacted_mps) / ahead[rows]
+    return max(float(speed.min()), _CREEPS_MPS)
 
 
 def stop_limit(known: Privileged) -> float:
