@@ -253,6 +253,7 @@ def _arguments(net_path: Path, sumo_seed: int, begin_s: int) -> list[str]:
         "step-length": TICK_MS / 1000,
         "pedestrian.model": "striping",
         "pedestrian.striping.dawdling": 0,
+        "pedestrian.striping.reserve-oncoming": 0.34,
         "pedestrian.striping.walkingarea-detail": 20,
         "pedestrian.striping.jamtime": -1,
         "pedestrian.striping.jamtime.crossing": -1,
