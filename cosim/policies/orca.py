@@ -12,8 +12,9 @@ The route is led round what stands on it for good (`guide`). Each time it acts:
 3. many plans are driven ahead in the head (`foresight`), and the one is taken that comes nearest to that velocity
    while the body stays clear of everybody and on free ground (`clearance`).
 
-Red signals, cars near a crossing and a stopping hand limit the speed so that it comes to rest before them; for who
-walks straight at it from near, or across its way, it stands, since people go round a robot that does.
+Red signals, cars near a crossing, a stopping hand and whoever of the crowd is right before it limit the speed so that
+it comes to rest before them; for who walks straight at it from near, or across its way, it stands, since people go
+round a robot that does. Where a green is too short it comes up slowly, so that it stands there at red.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ class Here(NamedTuple):
 class Orca:
     """Anticipates, yields, goes round groups, stops for a hand: the oracle; knows what no camera sees."""
 
-    manifest = Manifest("orca", version="3", rate_hz=5.0, camera=None, privileged=True)
+    manifest = Manifest("orca", version="4", rate_hz=5.0, camera=None, privileged=True)
 
     def __init__(self) -> None:
         self.reset("", 0)
