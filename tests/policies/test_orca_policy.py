@@ -20,7 +20,7 @@ from cosim.policies.clearance import Clearance
 from cosim.policies.encounters import Yielding, gaps_to_people
 from cosim.policies.foresight import STEP_S, Plans, Way, foresee
 from cosim.policies.groups import distances, groups, lines
-from cosim.policies.orca import STOP_BEFORE_M, Here, Orca, car_nearness, lane_past, stop_limit
+from cosim.policies.orca import STOP_BEFORE_M, Here, Orca, car_nearness, lane_past, pressed_limit, stop_limit
 from cosim.policies.route import crossing_limit
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec
@@ -80,6 +80,33 @@ def test_it_comes_to_rest_before_a_hand_and_stays() -> None:
         x_m += 0.1 * v_mps
     assert v_mps == 0.0
     assert 12.0 - x_m == pytest.approx(STOP_BEFORE_M, abs=0.15)
+
+
+def test_it_does_not_stand_long_at_a_green_that_is_too_short() -> None:
+    """14 m of crossing and 13 s of green left: it stands before it for 8 s at most when the signal turns red."""
+    driver, x_m, v_mps, stood_s = Driver(Orca()), 3.0, 1.4, 0.0
+    for tick in range(130):
+        signals = {":c0": Signal(True, 13.0 - 0.1 * tick)}
+        here = replace(known(people(), x_m, v_mps), crossings=((":c0", 6.0, 20.0),), signals=signals)
+        command = driver.act(Observation(2 * tick, 0.1 * tick, None, v_mps, 0.0, COURIER, here))
+        v_mps += max(-0.2, min(0.2, command.v_mps - v_mps))
+        x_m += 0.1 * v_mps
+        stood_s = stood_s + 0.1 if v_mps < 0.03 else 0.0
+    assert v_mps == 0.0 and 4.5 < x_m < 6.0 - COURIER.length_m / 2
+    assert 2.0 < stood_s < 8.0
+
+
+def test_it_comes_to_rest_before_whoever_of_the_crowd_is_right_ahead() -> None:
+    """The nearer they are the slower, never slower than a creep; not for who is beside, nor for people of events."""
+    here = known(people((6.0, 0.2, 0.0, 0.0, "stand")))
+    crowd = replace(here, people=dataclasses.replace(here.people, kind=np.full(1, PersonKind.CROWD.value)))
+    limits = [
+        pressed_limit(replace(crowd, robot=RobotState(Pose(x_m, 0.0, 0.0), 1.0)), COURIER)
+        for x_m in (3.0, 4.5, 5.1, 5.3)
+    ]
+    assert limits == sorted(limits, reverse=True) and limits[0] > 1.5 and limits[2] < 0.7 and limits[3] > 0.1
+    assert pressed_limit(replace(crowd, robot=RobotState(Pose(6.0, -0.7, 0.0), 1.0)), COURIER) == math.inf
+    assert pressed_limit(here, COURIER) == math.inf
 
 
 @pytest.mark.parametrize(
