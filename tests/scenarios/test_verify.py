@@ -247,6 +247,4 @@ def test_a_changed_constant_of_the_crowd_is_found(monkeypatch: pytest.MonkeyPatc
     (case,) = [case for case in verified_cases() if case.id == "lh-001-00"]
     monkeypatch.setattr(pose_filter, "MAX_SPEED_MPS", 1.2)
     trace, told = traced(replace(case, time_limit_s=1.0)), shipped.traces[case.id]
-    assert isinstance(told, Trace)
-    differs = first_difference(told, trace)
-    assert differs is not None and differs[0] == "crowd"
+    assert isinstance(told, Trace) and first_difference(told, trace)[0] == "crowd"
