@@ -5,6 +5,7 @@ scenarios.json                   the resolved specs
 episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at all; frames/
 results.sqlite                   one row per finished episode, in the order in which they ended
 results.csv                      the same, sorted by scenario, written at the end
+figures.json                     how fast it was, each time that it went on
 logs/                            what the engines of each worker printed
 lock                             held while a run is going on
 """

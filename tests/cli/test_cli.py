@@ -206,6 +206,18 @@ def test_the_same_run_gives_the_same_bits_on_any_number_of_processes(desk: Path,
     assert (desk / "two/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
 
 
+def test_shards_that_are_merged_are_the_run(desk: Path, cosim: Cosim, whole_run: Path) -> None:
+    """Of three episodes in two shards; each knows which it is, and says what to do with it."""
+    words = ("run", "tiny.json", "--policy", "straight", "--camera", "bullet", "--seed", SEED)
+    for shard in ("1/2", "2/2"):
+        said = cosim(*words, "--shard", shard, "--out", f"shard-{shard[0]}", cwd=desk)
+        assert said.returncode == 0 and f"Shard {shard} of the run: `cosim merge`" in said.stderr
+    assert [*hashes(desk / "shard-2")] == ["t-1"]
+    assert cosim("merge", "shard-1", "shard-2", "--out", "merged", cwd=desk).returncode == 0
+    assert (desk / "merged/results.csv").read_bytes() == (whole_run / "results.csv").read_bytes()
+    assert (desk / "merged/run.json").read_bytes() == (whole_run / "run.json").read_bytes()
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM], ids=lambda how: how.name)
 def test_an_interrupted_run_is_finished_by_resume(
     desk: Path, cosim: Cosim, unbroken: bytes, how: signal.Signals
