@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from cosim.spec.odometry import Odometry
     from cosim.spec.options import EpisodeOptions
     from cosim.spec.picture import Calibration, CameraPicture
+    from cosim.spec.policy_host import PolicyHost
     from cosim.spec.robot import Mount, Robot
     from cosim.spec.scenario import Scenario, Suite
     from scenarios.catalog import load_suite
@@ -56,6 +57,7 @@ __all__ = [
     "Odometry",
     "PointGoal",
     "Policy",
+    "PolicyHost",
     "Record",
     "Robot",
     "RoutePatch",
@@ -85,6 +87,7 @@ _HOMES = {
     "Odometry": "cosim.spec.odometry",
     "PointGoal": "cosim.spec.goal",
     "Policy": "cosim.episode.ports",
+    "PolicyHost": "cosim.spec.policy_host",
     "Record": "cosim.records.record",
     "Robot": "cosim.spec.robot",
     "RoutePatch": "cosim.spec.goal",

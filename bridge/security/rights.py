@@ -44,7 +44,7 @@ RIGHTS: Final[dict[Role, _Rights]] = {
 _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
     "coordinator": ("worker", "policy", "viewer", "injector"),
     "director": ("worker", "coordinator"),
-    "policy": ("worker", "coordinator"),
+    "policy": ("worker", "coordinator", "policy"),
 }
 """Whom a hub has business with."""
 _LARGEST_B: Final = {

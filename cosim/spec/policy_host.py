@@ -15,7 +15,11 @@ behind Zenoh, where its pictures may have been sent as JPEG."""
 
 class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     """Where the policy of a run is. isolated: in a process of its own. servers: where those of a remote one are found;
-    run: signs what they are asked, so that none mistakes one run for another."""
+    run: signs what they are asked, so that none mistakes one run for another.
+
+    >>> PolicyHost(isolated=True).servers
+    ()
+    """
 
     isolated: bool = False
     servers: tuple[Connection, ...] = ()

@@ -6,6 +6,7 @@ python served_policies.py CLASS NAME ENDPOINT
 import os
 import signal
 import sys
+import time
 from pathlib import Path
 from typing import ClassVar
 
@@ -29,15 +30,19 @@ class Steady:
 
 
 class Dying(Steady):
-    """Kills its process at the third question of an episode, but for the second time that it comes so far."""
+    """Kills its process at the third question of an episode, but for the second time that it comes so far;
+    the fifth time it gives no answer."""
 
     def act(self, seen):
         answer = super().act(seen)
         if self.count == 3:
             with Path("thirds").open("a") as thirds:
                 thirds.write(".")
-            if Path("thirds").stat().st_size != 2:
+            size = Path("thirds").stat().st_size
+            if size in (1, 3, 4):
                 os.kill(os.getpid(), signal.SIGKILL)
+            if size == 5:
+                time.sleep(3600)
         return answer
 
 

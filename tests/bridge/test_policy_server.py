@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import signal
+import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -39,8 +43,8 @@ from cosim.spec.policy_host import PolicyHost
 from cosim.spec.robot import COURIER
 from scenarios.serving import remote
 from scenarios.serving.drivers import known_driver
-from scenarios.serving.remote import RemoteDriver, remote_driver
-from tests.conftest import PATIENCE_S
+from scenarios.serving.remote import PolicyServers, RemoteDriver, remote_driver
+from tests.conftest import PATIENCE_S, ROOT, Cosim
 
 SPEC = CameraSpec(64, 40)
 RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
@@ -387,3 +391,47 @@ def test_an_object_answers_for_one_episode_at_a_time_and_a_class_for_many() -> N
     act = AskAct("r", "k2", "a", 0, 0, 0.0, 0.0, 0.0, arrays={"rgb": packed(RGB)})
     first, again, later = (decode_answered(one) for one in many.answers([encode_asked(act)] * 3))
     assert first == again == later and len(made[1].asked) == 1
+
+
+@pytest.mark.engine
+def test_cosim_serve_is_asked_beside_others_where_one_listens(tmp_path: Path) -> None:
+    """Two processes, one listening and one connecting to it, answer for one policy with what cosim gives policies; one
+    that is told what the simulator knows is refused."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    words = [sys.executable, "-m", "cosim", "serve", "tests.scenarios.isolated_policies:Honest", "--name", "both"]
+    at = Connection(role="coordinator", connect=endpoint)
+    with (
+        subprocess.Popen([*words, "--listen", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True) as one,
+        subprocess.Popen([*words, "--connect", endpoint], cwd=ROOT, stdout=subprocess.PIPE, text=True) as other,
+    ):
+        try:
+            assert one.stdout is not None and "policy 'both' answers at tcp/127.0.0.1:" in one.stdout.readline()
+            assert other.stdout is not None and "stop with Ctrl-C" in other.stdout.readline()
+            servers = PolicyServers("both", PolicyHost(servers=(at,)))
+            wait_until(lambda: len(servers.know(PATIENCE_S)) == 2)
+            servers.close()
+            driver = remote_driver("zenoh:both", PolicyHost(servers=(at,), run="r"))
+            driver.reset("k1", 1)
+            assert driver.act(seen_at(0)).v_mps == pytest.approx(1.0 + RGB.mean() / 1e4)
+            driver.close()
+            one.send_signal(signal.SIGINT)
+            assert one.wait(PATIENCE_S) == 130
+        finally:
+            one.kill()
+            other.kill()
+
+
+def test_a_policy_that_knows_everything_is_not_served(cosim: Cosim) -> None:
+    """Nor is there an endpoint for a policy of this machine: in a line."""
+    said = cosim("serve", "route")
+    assert said.returncode == 2 and "a remote one sees only observations" in said.stderr
+    said = cosim("run", "unit", "--policy", "stop", "--policy-at", "tcp/127.0.0.1:7449")
+    assert said.returncode == 2 and "--policy-at goes with --policy zenoh:NAME, not with 'stop'" in said.stderr
+    said = cosim("serve", "stop", "--listen", "tcp/0.0.0.0:7449")
+    assert said.returncode == 2 and "is beyond this machine and unguarded" in said.stderr
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])

@@ -149,22 +149,34 @@ def one_second(name: str) -> Scenario:
 def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(tmp_path: Path, cosim: Cosim) -> None:
     """kill -9 in the third question: another server drives it from its start, to the hash of a policy that drives in
     the simulator's process; the second time the episode has crashed. Rows and run.json say `remote`, and the record how
-    long answers took."""
+    long answers took. One that never answers has crashed at once."""
     shutil.copy(SERVER, tmp_path)
     shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
-    suite = Suite(name="two", version="1", scenarios=(one_second("a"), one_second("b")))
+    suite = Suite(name="three", version="1", scenarios=(one_second("a"), one_second("b"), one_second("c")))
     seed, endpoint = seed_in_order(suite.scenarios), free_endpoint()
-    write_suite(suite, tmp_path / "two.json")
-    words = ("--policy", "zenoh:dying", "--policy-at", endpoint, "--seed", str(seed), "--out", "run")
+    write_suite(suite, tmp_path / "three.json")
+    words = (
+        "--policy",
+        "zenoh:dying",
+        "--policy-at",
+        endpoint,
+        "--seed",
+        str(seed),
+        "--out",
+        "run",
+        "--answer-timeout",
+        "8",
+    )
     with running([*three_packages(tmp_path), "served_policies.py", "Dying", "dying", endpoint], tmp_path):
         found("zenoh:dying", endpoint, tmp_path / "printed").close()
-        said = cosim("run", "two.json", *words, cwd=tmp_path)
-    a, b = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario)
+        said = cosim("run", "three.json", *words, cwd=tmp_path)
+    a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario)
     here = suite_run.run(
-        Suite(name="two", version="1", scenarios=(one_second("a"),)), Honest(), options=EpisodeOptions(seed=seed)
+        Suite(name="three", version="1", scenarios=(one_second("a"),)), Honest(), options=EpisodeOptions(seed=seed)
     )
     assert (a.status, [a.state_hash]) == ("done", here["state_hash"].tolist()), a.reason + said.stderr
     assert b.status == "crashed" and "of policy 'dying' is gone, 2 times" in b.reason
+    assert c.status == "crashed" and "policy 'honest' gave no answer for 8 s in act at 0.50 s of c" in c.reason
     assert a.policy_runs == b.policy_runs == read_spec(tmp_path / "run").policy_runs == "remote"
     assert a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0 and "policy remote" in said.stdout
-    assert said.returncode == 1 and (tmp_path / "thirds").stat().st_size == 4
+    assert said.returncode == 1 and (tmp_path / "thirds").stat().st_size == 5

@@ -20,13 +20,15 @@ serve_app = typer.Typer()
     "`cosim serve my_robot.policy:Mine --name mine`, "
     "`cosim run reactive --policy zenoh:mine --policy-at tcp/127.0.0.1:7449`  \n"
     "`cosim serve my_robot.policy:Mine --name mine --listen tls/0.0.0.0:7449 --tls certs/policy`  \n"
-    "`cosim serve my_robot.policy:Mine --name mine --connect tls/hub.lan:7447 --tls certs/policy`: at a coordinator",
+    "`cosim serve my_robot.policy:Mine --name mine --connect tcp/127.0.0.1:7449`: a further one, where another listens",
 )
 def serve_command(
     policy: Annotated[str, typer.Argument(help="Your own, as package.module:Class, or a baseline.")],
     name: Annotated[str, typer.Option(help="What runs ask for, as --policy zenoh:NAME; else the manifest's.")] = "",
     listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where runs find it.")] = POLICIES_AT,
-    connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="A hub at which runs find it, instead.")] = "",
+    connect: Annotated[
+        str, typer.Option(metavar="ENDPOINT", help="Instead: where another one listens, beside which runs find it.")
+    ] = "",
     jpeg: Annotated[bool, typer.Option("--jpeg", help="Have pictures sent as JPEG; every row says so.")] = False,
     tls: Tls = "",
     insecure: Insecure = False,

@@ -58,4 +58,4 @@ def test_guards_without_a_door_are_refused(cosim: Cosim, tmp_path: Path) -> None
     """--tls and --insecure of a run that nobody can reach."""
     for more in (("--tls", str(tmp_path)), ("--insecure",)):
         refused = cosim("run", "no-such-suite", *more)
-        assert refused.returncode == 2 and f"{more[0]} goes with --live or --director" in refused.stderr
+        assert refused.returncode == 2 and f"{more[0]} goes with --live, --director or --policy-at" in refused.stderr
