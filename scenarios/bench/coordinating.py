@@ -72,7 +72,7 @@ class Served(NamedTuple):
 
 def coordinating() -> list[Figure]:
     """What an episode costs, and how many a second the coordinator takes in."""
-    alone, many = serve(*_ONE), serve(*_MANY)
+    alone, many = serve_made_up(*_ONE), serve_made_up(*_MANY)
     per_s = many.jobs / many.wall_s
     return [
         Figure("coordinator: from a result to the next job, ms", 1000.0 * alone.round_s, reach=5.0),
@@ -82,7 +82,7 @@ def coordinating() -> list[Figure]:
     ]
 
 
-def serve(workers: int, jobs: int) -> Served:
+def serve_made_up(workers: int, jobs: int) -> Served:
     """Coordinate so many jobs of so many workers, which are all in one process beside this one."""
     one = Scenario(
         id="j", suite="load", place=City(seed=0, net_hash="h"), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
@@ -195,7 +195,7 @@ def _main() -> None:
     if given.load:
         _load(given.load, given.workers)
         return
-    found = serve(given.workers, given.jobs)
+    found = serve_made_up(given.workers, given.jobs)
     print(
         f"{found.jobs} jobs by {given.workers} workers: {found.jobs / found.wall_s:.0f} a second, "
         f"{1000.0 * found.cpu_s / found.jobs:.2f} ms CPU each, {found.memory_mb:.0f} MB, "

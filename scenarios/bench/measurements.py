@@ -15,7 +15,18 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import EngineError, UsageError, unknown
-from scenarios.bench import cameras, coordinating, driving, episodes, growth, places, serving, starting, street, together
+from scenarios.bench import (
+    cameras,
+    coordinating,
+    driving,
+    episodes,
+    growth,
+    places,
+    serving,
+    starting,
+    street,
+    together,
+)
 from scenarios.bench.figures import MORE, Figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
