@@ -401,7 +401,7 @@ def serve(
 
     policy: an object; or a class, of which there is then one for each episode (`PolicyDesk`). told: its manifest, in
     place of `policy.manifest`: a mapping with the fields of `cosim.Manifest`; source: a hash of what it is written in.
-    name: what runs ask for, else the manifest's. listen, connect: one of both, as tcp/127.0.0.1:7449. tls: a folder
+    name: what runs ask for, else the manifest's. listen; or connect, to where `cosim serve` listens. tls: a folder
     with ca.pem, cert.pem and key.pem (`cosim certs`). insecure: it may reach beyond this machine without. jpeg:
     pictures are to come as JPEG. session: an open Zenoh session, in place of all that. Raises ValueError.
     """
@@ -418,30 +418,30 @@ def serve(
             info = PolicyInfo(server, name, manifest, source, desk.at_once, desk.under_way, jpeg)
             query.reply(f"{below}/info", encode_asked(info))
 
-    with (
-        nullcontext(session) if session else _opened(listen, connect, tls, insecure) as opened,
-        suppress(KeyboardInterrupt),
-    ):
+    opens = nullcontext(session) if session else _opened(listen, connect, tls, insecure)
+    with opens as opened, suppress(KeyboardInterrupt):
         declared = [opened.declare_queryable(f"{below}/info", tell, complete=True)]
         declared += [opened.declare_queryable(f"{below}/{kind}", asked.put, complete=True) for kind in _QUESTIONS]
         print(f"policy '{name}' answers at {listen or connect} as server {server}; stop with Ctrl-C", flush=True)
         while True:
-            _answer_waiting(desk, asked, below)
+            _answer_waiting(desk, asked)
 
 
-def _answer_waiting(desk: PolicyDesk, asked: Any, below: str) -> None:
+def _answer_waiting(desk: PolicyDesk, asked: Any) -> None:
     """Answer what is waiting, at least one question."""
     queries, until_s = [asked.get()], time.monotonic() + _WINDOW_S
     with suppress(queue.Empty):
         while True:
             waits = desk.batches and len(queries) < desk.under_way
             queries.append(asked.get(timeout=max(until_s - time.monotonic(), 0.0) if waits else 0.0))
-    payloads = [b"" if query.payload is None else query.payload.to_bytes() for query in queries]
+    # What asks several servers at once is no question to any: an answer would be lost.
+    read = [query.payload is not None and "*" not in str(query.key_expr) for query in queries]
+    payloads = [query.payload.to_bytes() if reads else b"" for query, reads in zip(queries, read)]
     for query, reply in zip(queries, desk.answers(payloads)):
         with query:
             if isinstance(decode_answered(reply), Refusal):
                 query.reply_err(reply)
-            elif str(query.key_expr).startswith(f"{below}/"):
+            else:
                 query.reply(query.key_expr, reply)
 
 
@@ -473,23 +473,25 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
             "that is sent. Use tls/... with tls=FOLDER (`cosim certs` makes it), or say insecure"
         )
     settings: dict[str, Any] = {
-        "mode": "router" if listen else "client",
-        "listen/endpoints": [listen] if listen else [],
-        "connect/endpoints": [connect] if connect else [],
-        "connect/timeout_ms": 0 if listen else 10_000,
-        "scouting/multicast/enabled": False,
-        "transport/link/tx/lease": 2000,
-        "transport/shared_memory/enabled": False,
-        "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
-    }
+        "mode": "router" if listen else "client", "connect/timeout_ms": 0 if listen else 10_000,
+        "listen/endpoints": [listen] if listen else [], "connect/endpoints": [connect] if connect else [],
+        "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False,
+        "transport/link/tx/lease": 2000, "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
+    }  # fmt: skip
     if tls:
-        guard: dict[str, Any] = {"root_ca_certificate": str(Path(tls, "ca.pem")), "enable_mtls": True}
-        for end in ("listen", "connect"):
-            guard[f"{end}_certificate"], guard[f"{end}_private_key"] = (
-                str(Path(tls, "cert.pem")),
-                str(Path(tls, "key.pem")),
-            )
-        settings["transport/link/tls"] = guard
+        ours = {"certificate": str(Path(tls, "cert.pem")), "private_key": str(Path(tls, "key.pem"))}
+        guard = {f"{end}_{what}": path for end in ("listen", "connect") for what, path in ours.items()}
+        guard |= {"root_ca_certificate": str(Path(tls, "ca.pem"))}
+        settings["transport/link/tls"] = {**guard, "enable_mtls": True, "verify_name_on_connect": True}
+    if listen and found[1]:  # runs may ask; nobody else may, and nobody may answer in its place
+        may = {"permission": "allow", "key_exprs": ["cosim/*/policy/**"]}
+        flows = {"ingress": ["query"], "egress": ["declare_queryable", "reply"]}
+        rules = [{"id": flow, "flows": [flow], "messages": messages, **may} for flow, messages in flows.items()]
+        who = {"cert_common_names": ["worker", "coordinator"]} if tls else {"link_protocols": ["tcp"]}
+        settings["access_control"] = {
+            "enabled": True, "default_permission": "deny", "rules": rules, "subjects": [{"id": "runs", **who}],
+            "policies": [{"rules": ["ingress", "egress"], "subjects": ["runs"]}],
+        }  # fmt: skip
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))

@@ -42,7 +42,7 @@ RIGHTS: Final[dict[Role, _Rights]] = {
     "injector": _Rights("inject pedestrians", ask=(f"{_ENV}/inject", f"{_ENV}/status")),
 }
 _ADMITTED: Final[dict[Role, tuple[Role, ...]]] = {
-    "coordinator": ("worker", "policy", "viewer", "injector"),
+    "coordinator": ("worker", "policy", "viewer", "injector", "coordinator"),
     "director": ("worker", "coordinator"),
     "policy": ("worker", "coordinator", "policy"),
 }

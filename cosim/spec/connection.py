@@ -65,6 +65,10 @@ class Connection(msgspec.Struct, frozen=True, kw_only=True):
         """Where it listens or connects to."""
         return self.listen or self.connect
 
+    def seen_by(self, other: Connection) -> Connection:
+        """The same endpoint as the end that `other` is of reaches it: in its role, with its certificates."""
+        return msgspec.structs.replace(self, role=other.role, tls=other.tls if self.tls else "")
+
     @property
     def of_this_machine(self) -> bool:
         """Whether nobody on another machine can reach it, or be reached by it."""

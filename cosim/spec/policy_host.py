@@ -24,3 +24,7 @@ class PolicyHost(msgspec.Struct, frozen=True, kw_only=True):
     isolated: bool = False
     servers: tuple[Connection, ...] = ()
     run: str = ""
+
+    def seen_by(self, worker: Connection) -> PolicyHost:
+        """As a worker on another machine reaches it, who has this connection to the run."""
+        return msgspec.structs.replace(self, servers=tuple(one.seen_by(worker) for one in self.servers))

@@ -11,9 +11,12 @@ from logging import WARNING
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, NamedTuple
 
+import msgspec
+
 from bridge.codec import encode
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.journal import happened
+from cosim.spec.connection import Connection
 from cosim.spec.scenario import CityMap
 from scenarios.execution.asked import Question
 from scenarios.execution.messages import (
@@ -81,9 +84,13 @@ class RunEnded(Exception):
 
 
 class WorkSlot:
-    """worker, number: by what the coordinator knows it; host: for people; logs: the folder for what it prints."""
+    """worker, number: by what the coordinator knows it; host: for people; logs: the folder for what it prints; reach:
+    how the coordinator is reached."""
 
-    def __init__(self, worker: str, number: int, host: str, installed: Installed, logs: Path) -> None:
+    def __init__(
+        self, worker: str, number: int, host: str, installed: Installed, logs: Path, reach: Connection
+    ) -> None:
+        self._reach = reach
         self._worker, self._number, self._host, self._installed = worker, number, host, installed
         self._log = logs / f"{number}.log"
         self._read = 0
@@ -218,7 +225,8 @@ class WorkSlot:
 
     def _start(self, welcome: Briefing) -> None:
         self._process = KeptProcess(self._log, WORKER, "environment")
-        self._process.send(encode_message(welcome.hello))
+        hello = msgspec.structs.replace(welcome.hello, host=welcome.hello.host.seen_by(self._reach))
+        self._process.send(encode_message(hello))
         self._ready = self._ran = False
         self._heard_s = time.monotonic()
         self._give()

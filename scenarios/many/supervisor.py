@@ -99,7 +99,7 @@ def work(connection: Connection, jobs: int, say: Say, *, once: bool = False, log
                 leaving.wait([], _RETRY_S)
                 continue
             told = False
-            if _Service(session, runs[0], jobs, logs, leaving, say).serve():
+            if _Service(session, connection, runs[0], jobs, logs, leaving, say).serve():
                 if once:
                     return 0
                 over, over_s = runs[0], time.monotonic()
@@ -123,12 +123,14 @@ def _reached(connection: Connection, leaving: Leaving, say: Say) -> Session | No
 class _Service:
     """For one run."""
 
-    def __init__(self, session: Session, run: str, jobs: int, logs: Path, leaving: Leaving, say: Say) -> None:
+    def __init__(
+        self, session: Session, reach: Connection, run: str, jobs: int, logs: Path, leaving: Leaving, say: Say
+    ) -> None:
         self._session, self._run, self._leaving, self._say = session, run, leaving, say
         host = socket.gethostname()
         self._name = keys.chunk(f"{host[:40]}-{os.getpid()}-{secrets.token_hex(3)}")
         installed = installed_here()
-        self._slots = [WorkSlot(self._name, number, host, installed, logs) for number in range(jobs)]
+        self._slots = [WorkSlot(self._name, number, host, installed, logs, reach) for number in range(jobs)]
         self._replies: queue.SimpleQueue[tuple[WorkSlot | None, str, bytes | None, str]] = queue.SimpleQueue()
         self._heard_s = time.monotonic()
         self._looking, self._quiet, self._told = False, False, ""

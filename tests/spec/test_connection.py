@@ -62,6 +62,10 @@ def test_it_travels_to_other_processes_as_it_is() -> None:
     role: Role = "worker"
     one = Connection(role=role, connect="tls/hub.lan:7447", tls="certs/worker")
     assert msgspec.msgpack.decode(msgspec.msgpack.encode(one), type=Connection) == one
+    there = Connection(role="coordinator", connect="tls/gpu.lan:7449", tls="certs/coordinator")
+    assert there.seen_by(one) == Connection(role="worker", connect="tls/gpu.lan:7449", tls="certs/worker")
+    with pytest.raises(UsageError, match="needs --tls FOLDER"):
+        there.seen_by(Connection(role="worker", connect="tcp/127.0.0.1:7447"))
     bad = msgspec.msgpack.encode({"role": role, "connect": "tcp/hub.lan:7447"})
     with pytest.raises(UsageError, match="unguarded"):
         msgspec.msgpack.decode(bad, type=Connection)

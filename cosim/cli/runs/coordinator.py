@@ -50,7 +50,10 @@ def coordinator_command(
     from bridge.session import notices_of, open_session
     from scenarios.many.workers import workers_of_run
 
-    connection = listening("coordinator", "--listen", listen, tls, insecure)
+    at = asked["policy_at"] or ()
+    files = tls if any(one.startswith("tls/") for one in at) else ""
+    ours = tls if listen.startswith("tls/") or not files else ""
+    connection = listening("coordinator", "--listen", listen, ours, insecure)
     notices_of(connection)
 
     @contextmanager
@@ -59,7 +62,7 @@ def coordinator_command(
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
             yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
 
-    carry_out(**asked, carrier=carrier())
+    carry_out(**asked, tls=files, insecure=insecure and bool(at), carrier=carrier())
 
 
 @coordinator_app.command(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -33,10 +35,10 @@ MAY_ASK: dict[str, tuple[str, ...]] = {
     "viewer": SEEN,
     "injector": (f"{ENV}/inject", f"{ENV}/status"),
     "policy": (),
-    "coordinator": (),
+    "coordinator": (f"{ENV}/director", POLICY),
     "director": (),
 }
-"""At a coordinator's hub. The last two have no business there: others connect to them."""
+"""At a coordinator's hub. A director has no business there: others connect to it."""
 
 
 @pytest.fixture(scope="module")
@@ -222,6 +224,41 @@ def test_who_is_asked_is_asked_by_runs_alone(certs: Path, hub: Role, key: str) -
             assert set(replies(guests[role], key)) == {"FORGED"}, "its own answer, and nobody else's"
         assert asked == []
         assert session.ask(key, b"x", timeout_s=PATIENCE_S) == b"honest"
+
+
+COPIED = """
+import sys
+from bridge.policy_server import serve
+
+class Mine:
+    manifest = {"name": "mine", "rate_hz": 5.0}
+    def reset(self, episode_id, seed): print(f"reset of {episode_id}", flush=True)
+
+serve(Mine, listen=sys.argv[1], tls=sys.argv[2])
+"""
+
+
+def test_the_file_that_is_copied_is_asked_by_runs_alone(certs: Path) -> None:
+    """`serve` of policy_server.py by itself: workers and coordinators ask, one server at a time; else nobody."""
+    at = f"tls/localhost:{free_port()}"
+    words = [sys.executable, "-c", COPIED, at, str(certs / "policy")]
+    with ExitStack() as stack:
+        server = stack.enter_context(subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        stack.callback(server.kill)
+        assert server.stdout is not None and "answers at" in server.stdout.readline()
+        guests = {role: stack.enter_context(plain_zenoh(at, certs, role)) for role in get_args(Role)}
+        info = "cosim/default/policy/mine/*/info"
+        for role in ("worker", "coordinator"):
+            until(lambda role=role: len(list(guests[role].get(info))) == 1)  # type: ignore[misc]
+        for role in ("director", "policy", "viewer", "injector"):
+            assert list(guests[role].get(info)) == [], role
+        guests["viewer"].declare_queryable("cosim/**", lambda query: query.reply(query.key_expr, b"FORGED"))
+        begin = b"\x85\xa4type\xa5reset\xa3run\xa1r\xa7episode\xa1e\xa7attempt\xa1a\xa4seed\x00"
+        (wide,) = guests["worker"].get(info.replace("info", "reset"), payload=begin)
+        assert b"not a question" in wide.err.payload.to_bytes()
+        (told,) = guests["worker"].get(info)
+        (begun,) = guests["worker"].get(str(told.ok.key_expr).replace("info", "reset"), payload=begin)
+        assert b"begun" in begun.ok.payload.to_bytes() and server.stdout.readline() == "reset of e\n"
 
 
 @pytest.mark.parametrize("written", ["application/python-serialized-object", "application/x-unheard-of"])
