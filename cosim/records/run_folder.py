@@ -57,6 +57,7 @@ class RunFolder:
         self.notes: list[str] = []
         self._suite = suite
         self._lock = -1
+        self._adding: sqlite3.Connection | None = None
 
     @classmethod
     def create(cls, path: Path, spec: RunSpec, suite: Suite) -> RunFolder:
@@ -99,6 +100,9 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        if self._adding is not None:
+            self._adding.close()
+            self._adding = None
         os.close(self._lock)
 
     def episode_folder(self, scenario_id: str) -> Path:
@@ -117,7 +121,9 @@ class RunFolder:
         row = json.dumps(table_row(record), sort_keys=True)
         text = msgspec.json.encode(record).decode()
         try:
-            with closing(_connect(self.path)) as database, database:
+            if self._adding is None:  # kept open: opening and closing takes longer than adding
+                self._adding = _connect(self.path)
+            with self._adding as database:
                 database.execute("insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text))
         except sqlite3.Error as error:
             raise _trouble(self.path, error) from error

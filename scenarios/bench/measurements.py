@@ -15,13 +15,24 @@ from typing import Final
 import msgspec
 
 from cosim.core.errors import EngineError, UsageError, unknown
-from scenarios.bench import cameras, driving, episodes, growth, places, serving, starting, street, together
+from scenarios.bench import (
+    cameras,
+    coordinating,
+    driving,
+    episodes,
+    growth,
+    places,
+    serving,
+    starting,
+    street,
+    together,
+)
 from scenarios.bench.figures import MORE, Figure
 
 ROOT: Final = Path(__file__).resolve().parents[2]
 ENVIRONMENT: Final = ("driving", "large pictures", "towns", "starting", "street 50", "street 150", "places", "reactive")
 """Taken by `cosim bench`."""
-ON_REQUEST: Final = ("ten environments", "200 episodes", "serving")
+ON_REQUEST: Final = ("ten environments", "200 episodes", "serving", "200 workers")
 """Taken by `cosim bench` when they are named: for a machine of many cores, and for minutes."""
 _ENGINES: Final = "engines"
 
@@ -46,6 +57,7 @@ _TAKEN: Final[Mapping[str, Callable[[], list[Figure]]]] = {
     "ten environments": together.driving_together,
     "200 episodes": growth.growing,
     "serving": serving.asking_elsewhere,
+    "200 workers": coordinating.coordinating,
     **CAMERA,
 }
 

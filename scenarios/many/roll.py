@@ -94,7 +94,7 @@ class _Known:
     """What is known of a worker."""
 
     def __init__(self, host: str) -> None:
-        self.host, self.state, self.why, self.done = host, "idle", "", 0
+        self.host, self.state, self.why, self.done, self.there = host, "idle", "", 0, True
         self.heard_s = time.monotonic()
         self.under_way: dict[int, _Underway] = {}
 
@@ -113,8 +113,8 @@ class Roll:
 
     @property
     def anybody(self) -> bool:
-        """Whether a worker is there that does not know yet that the run is over."""
-        return any(one.state in ("working", "idle") for one in self._known.values())
+        """Whether a worker is there."""
+        return any(one.there for one in self._known.values())
 
     def tell(self, message: Message) -> None:
         """Something that a worker has said of its episode."""
@@ -166,6 +166,8 @@ class Roll:
     def gone(self, worker: str) -> None:
         """A worker is not seen any more."""
         one = self._known.get(worker)
+        if one is not None:
+            one.there = False
         if one is None or one.state in ("left", "turned away"):
             return
         self._lost += len(one.under_way)
@@ -251,7 +253,7 @@ class Roll:
                 del self._known[name]
             one = self._known[worker] = _Known(host or worker)
             self.note(f"{worker}: is there")
-        one.heard_s = time.monotonic()
+        one.heard_s, one.there = time.monotonic(), True
         return one
 
 

@@ -129,7 +129,8 @@ class RemoteWorkers:
         self._roll.tend()
 
     def part(self) -> None:
-        """The run is over: tell it to those who ask, for a while."""
+        """The run is over: tell it to those who ask, until they have left; what is told just before a session closes
+        may be lost."""
         self._over = True
         until_s = time.monotonic() + PARTING_S
         for query, _ in self._claims.values():
