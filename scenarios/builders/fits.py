@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack
+from multiprocessing import get_context
 from typing import Final
 
 import numpy as np
 import shapely
 from shapely.geometry import LineString, Point
 
-from cosim.core.errors import MapError, SpecError, UsageError
+from cosim.core.errors import MachineError, MapError, SpecError, UsageError
 from cosim.core.telling import Tell, untold
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.obstacle import footprint
@@ -23,6 +28,8 @@ from scenarios.execution.places import place
 from sumo_nets.crowd.room import Room
 
 LOOKING: Final = "looking where the episodes take place"
+_PLACES_A_PROCESS: Final = 8
+"""Fewer are looked at sooner than another process begins."""
 _AROUND_M: Final = 3.0
 """So much of a place is looked at around routes and events."""
 _SAMPLE_M: Final = 0.5
@@ -32,8 +39,9 @@ BESIDE_STRIP_M: Final = 8.0
 """So far from the strip that it closes a barrier may stand: strips end where corners begin, and those are wide."""
 
 
-def check_places(whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untold) -> None:
-    """Make what is needed of the places of some scenarios of a suite, and look whether each fits its own.
+def check_places(whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untold, jobs: int = 1) -> None:
+    """Make what is needed of the places of some scenarios of a suite, and look whether each fits its own: place by
+    place, by `jobs` processes where there are many.
 
     Raises SpecError with everything that does not fit, scenario by scenario; what the machine lacks as MachineError.
     """
@@ -41,17 +49,37 @@ def check_places(whole: Suite, scenarios: Sequence[Scenario], tell: Tell = untol
     for scenario in scenarios:
         there.setdefault(scenario.place, []).append(scenario)
     faults = [*_not_here(scenarios), *_odd_events(scenarios)]
-    for number, (where, those) in enumerate(there.items()):
-        tell(LOOKING, number / len(there))
-        try:
-            _, street_map = place(where)
-        except (MapError, UsageError, SpecError) as error:
-            more = f" and {len(those) - 1} more" if len(those) > 1 else ""
-            faults.append(f"scenario '{those[0].id}'{more}: {error}")
-            continue
-        faults += misfits(those, street_map)
+    jobs = min(jobs, len(there) // _PLACES_A_PROCESS)
+    with ExitStack() as stack:
+        if jobs > 1:
+            made = ProcessPoolExecutor(jobs, get_context("spawn"), initializer=_deaf_to_ctrl_c)
+            stack.callback(made.shutdown, cancel_futures=True)
+            found = made.map(_misfits_at, there, there.values())
+        else:
+            found = map(_misfits_at, there, there.values())
+        for number in range(len(there)):
+            tell(LOOKING, number / len(there))
+            try:
+                faults += next(found)
+            except BrokenProcessPool as error:
+                raise MachineError("a process that looked at places was ended: is there enough memory?") from error
     if faults:
         raise SpecError(f"suite '{whole.name}': {in_lines(faults)}")
+
+
+def _deaf_to_ctrl_c() -> None:
+    """Who started this process ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def _misfits_at(where: Place, scenarios: Sequence[Scenario]) -> list[str]:
+    """What does not fit of scenarios that take place at one place, which is made where there is none."""
+    try:
+        _, street_map = place(where)
+    except (MapError, UsageError, SpecError) as error:
+        more = f" and {len(scenarios) - 1} more" if len(scenarios) > 1 else ""
+        return [f"scenario '{scenarios[0].id}'{more}: {error}"]
+    return [*misfits(scenarios, street_map)]
 
 
 def misfits(scenarios: Sequence[Scenario], street_map: StreetMap) -> Iterator[str]:

@@ -14,7 +14,7 @@ from cosim.core.errors import SpecError
 from cosim.place.street_map import Corner, Port, StreetMap, Strip
 from cosim.spec.events import Event
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.scenario import Barrier, City, CrowdSpec, Light, RouteCrossing, Scenario, Suite
+from cosim.spec.scenario import Barrier, City, CityMap, CrowdSpec, Light, RouteCrossing, Scenario, Suite
 from scenarios.builders import fits
 from scenarios.builders.fits import check_places, misfits
 
@@ -156,3 +156,16 @@ def test_every_place_is_looked_at_once_and_all_is_told_together(monkeypatch: pyt
     assert "hdri 'nowhere.hdr' does not exist" in faults[1]
     assert all(f"scenario 'odd-{i}': event 'e0' is off" in faults[2 + i] for i in range(3))
     check_places(whole, [s for s in scenarios if s.id.startswith("fine")])
+
+
+def test_many_places_are_looked_at_by_several_processes() -> None:
+    """The same is told in the same order as by one."""
+    where = [CityMap(map=f"nowhere-{i}") for i in range(16)]
+    lost = tuple(msgspec.structs.replace(from_west_to_east(), id=f"s{i}", place=at) for i, at in enumerate(where))
+    whole = Suite(name="w", version="1", scenarios=lost)
+    told = []
+    for jobs in (1, 2):
+        with pytest.raises(SpecError) as refusal:
+            check_places(whole, lost, jobs=jobs)
+        told.append(str(refusal.value))
+    assert told[0] == told[1] and "16 faults" in told[0] and "scenario 's4': unknown map 'nowhere-4'" in told[0]

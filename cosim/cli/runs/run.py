@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections.abc import Callable
@@ -180,7 +181,7 @@ def carry_out(
     suffix = "" if part is None else f"-{part.number}-of-{part.of}"
     path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}{suffix}"
     with doing(LOOKING) as looking:
-        check_places(whole, picked, looking)
+        check_places(whole, picked, looking, jobs if carrier is None else len(os.sched_getaffinity(0)))
     named = keys.chunk(path.name)
     on_air = None if air is None else Live(connection=air, run=named)
     outside = None if away is None else Outside(connection=away, run=named, wait_s=director_wait)
