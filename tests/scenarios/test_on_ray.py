@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
+import psutil
 import pytest
 
 from cosim.core.errors import UsageError
@@ -67,6 +68,11 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
             cluster.shutdown()
 
 
+def _runs(pid: int) -> bool:
+    """Whether a process goes on; one that nobody has buried does not."""
+    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+
+
 @pytest.mark.engine
 def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
@@ -82,7 +88,11 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     def kill_one() -> None:
         while len([*go.parent.glob("begun-*")]) < 2:
             time.sleep(0.05)
+        begun = [int(path.name.split("-")[1]) for path in go.parent.glob("begun-*")]
         cluster.remove_node(first, allow_graceful=False)
+        until_s = time.monotonic() + PATIENCE_S
+        while all(map(_runs, begun)) and time.monotonic() < until_s:  # what ran there must not come to its end first
+            time.sleep(0.05)
         go.touch()
 
     killer = threading.Thread(target=kill_one, daemon=True)
