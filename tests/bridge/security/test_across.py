@@ -12,11 +12,9 @@ from tests.bridge.security.namespaces import NotPermitted, network
 pytestmark = pytest.mark.engine
 
 
-def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(
-    tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    """With --whole, as it waits for links: every episode has one result though a worker's link is down for 6 s in the middle of one; meanwhile a viewer on a
-    host of its own sees that there is a run, and can finish none of its jobs."""
+def test_a_run_across_hosts_loses_nothing_when_a_link_goes_down(tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    """With --whole, as it waits for links: every episode has one result though a worker's link is down for 6 s in the
+    middle of one; meanwhile a viewer on a host of its own sees that there is a run, and can finish none of its jobs."""
     if not request.config.getoption("--whole"):
         pytest.skip("with --whole, or as a command: python -m tests.bridge.security.across")
     seen: list[str] = []
