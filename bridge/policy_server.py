@@ -476,7 +476,8 @@ def _opened(listen: str, connect: str, tls: str, insecure: bool) -> Any:
         "mode": "router" if listen else "client", "connect/timeout_ms": 0 if listen else 10_000,
         "listen/endpoints": [listen] if listen else [], "connect/endpoints": [connect] if connect else [],
         "scouting/multicast/enabled": False, "transport/shared_memory/enabled": False,
-        "transport/link/tx/lease": 2000, "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
+        "transport/link/tx/lease": 2000, "transport/link/tx/queue/size/data": 16,
+        "transport/link/rx/max_message_size": MOST_MESSAGE_BYTES,
     }  # fmt: skip
     if tls:
         ours = {"certificate": str(Path(tls, "cert.pem")), "private_key": str(Path(tls, "key.pem"))}

@@ -14,6 +14,7 @@ _ALWAYS: Final[dict[str, object]] = {
     "scouting/delay": 0,
     "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/tx/lease": 2000,
+    "transport/link/tx/queue/size/data": 16,
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": 16 << 20,
 }
