@@ -21,6 +21,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from cosim.rounding import settle_rounding
+
 if TYPE_CHECKING:
     from cosim.core.errors import CosimError
     from cosim.core.state import Command
@@ -38,6 +40,9 @@ if TYPE_CHECKING:
     from scenarios.catalog import load_suite
     from scenarios.execution.episode import Episode
     from scenarios.execution.suite_run import run
+    from scenarios.gym.making import make_env
+
+settle_rounding()
 
 __all__ = [
     "BatchPolicy",
@@ -66,6 +71,7 @@ __all__ = [
     "WaypointRule",
     "load_policy",
     "load_suite",
+    "make_env",
     "run",
 ]
 
@@ -96,6 +102,7 @@ _HOMES = {
     "WaypointRule": "cosim.episode.ports",
     "load_policy": "cosim.policies.load",
     "load_suite": "scenarios.catalog",
+    "make_env": "scenarios.gym.making",
     "run": "scenarios.execution.suite_run",
 }
 """The module of each public name (PEP 562: loaded on demand)."""

@@ -1,0 +1,1 @@
+import cosim as cosim  # before numpy is loaded: see cosim/rounding.py

@@ -36,6 +36,7 @@ from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Job
 from scenarios.execution.pool import run_all
 from scenarios.execution.suite_run import run_spec
+from scenarios.execution.transport import HeldRun
 from scenarios.many.words import Claim, Lease, Over, Result, TurnedAway, digest_of, installed_here, reply_in
 from scenarios.many.workers import workers_of_run
 
@@ -99,7 +100,9 @@ def serve_made_up(workers: int, jobs: int) -> Served:
         with (
             RunFolder.create(Path(folder) / "run", spec, suite) as held,
             open_session(Connection(role="coordinator", listen=endpoint)) as session,
-            workers_of_run(session, held, scenarios, scenarios, hello, Patience(), lambda _: None, resumed=False) as of,
+            workers_of_run(
+                session, HeldRun(held, hello, Patience(), scenarios, scenarios), lambda _: None, resumed=False
+            ) as of,
         ):
             load = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
             transport, tell = of

@@ -1,4 +1,4 @@
-"""How many short episodes an hour two environment processes drive."""
+"""How many short episodes environment processes drive: two an hour, and two beside one."""
 
 from __future__ import annotations
 
@@ -10,10 +10,14 @@ import time
 from typing import Final
 
 from cosim.core.errors import EngineError
+from cosim.spec.options import EpisodeOptions
 from scenarios.bench.figures import MORE, Figure
 
 _EPISODES: Final = 32
 _JOBS: Final = 2
+_COMPARED: Final = 48
+_WARM: Final = 4
+"""So many of those that are compared end before the clock runs: engines are loaded, places are read."""
 
 
 def reactive() -> list[Figure]:
@@ -33,3 +37,24 @@ def reactive() -> list[Figure]:
         raise EngineError(f"`cosim {' '.join(words)}` ended with exit code {done.returncode}: {done.stderr[-300:]}")
     name = f"reactive, {_JOBS} processes, episodes per hour"
     return [Figure(name, _EPISODES / hours, reach=1500.0, better=MORE)]
+
+
+def two_processes() -> list[Figure]:
+    """Short episodes a second, by two local processes beside one, once these have warmed up."""
+    one, two = _episodes_per_s(1), _episodes_per_s(2)
+    name = "reactive, two processes, episodes per s"
+    return [Figure(name, two, one, "one process", 1.85, MORE, reach_ratio=True)]
+
+
+def _episodes_per_s(jobs: int) -> float:
+    from scenarios.execution.messages import Done
+    from scenarios.execution.suite_run import run
+
+    ends_s: list[float] = []
+
+    def hear(message: object) -> None:
+        if isinstance(message, Done):
+            ends_s.append(time.monotonic())
+
+    run("reactive", "straight", episodes=_COMPARED, jobs=jobs, options=EpisodeOptions(seed=1), tell=hear)
+    return (_COMPARED - _WARM) / (ends_s[-1] - ends_s[_WARM - 1])

@@ -32,9 +32,10 @@ from scenarios.bench.figures import MORE, Figure
 ROOT: Final = Path(__file__).resolve().parents[2]
 ENVIRONMENT: Final = ("driving", "large pictures", "towns", "starting", "street 50", "street 150", "places", "reactive")
 """Taken by `cosim bench`."""
-ON_REQUEST: Final = ("ten environments", "200 episodes", "serving", "200 workers")
+ON_REQUEST: Final = ("ten environments", "200 episodes", "serving", "200 workers", "two processes", "first episode")
 """Taken by `cosim bench` when they are named: for a machine of many cores, and for minutes."""
 _ENGINES: Final = "engines"
+_FIRST_ALONE: Final = "first episode alone"
 
 
 def _camera(figure: cameras.Drawing) -> list[Figure]:
@@ -58,6 +59,7 @@ _TAKEN: Final[Mapping[str, Callable[[], list[Figure]]]] = {
     "200 episodes": growth.growing,
     "serving": serving.asking_elsewhere,
     "200 workers": coordinating.coordinating,
+    "two processes": episodes.two_processes,
     **CAMERA,
 }
 
@@ -70,6 +72,10 @@ def figures_of(name: str, started_s: float) -> list[Figure]:
         fresh, *others = starting.starting(started_s)
         (alone,) = taken(_ENGINES)
         return [msgspec.structs.replace(fresh, limit=alone.value, limit_is=starting.ENGINES_ALONE), *others]
+    if name == _FIRST_ALONE:
+        return starting.first_episode_alone(started_s)
+    if name == "first episode":
+        return starting.first_episode(started_s, lambda: taken(_FIRST_ALONE)[0])
     return _TAKEN[name]()
 
 

@@ -1,11 +1,16 @@
-"""How long it takes until the first picture: in a fresh process, and from one episode to the next."""
+"""How long it takes until the first picture, in a fresh process and from one episode to the next; and until the first
+episode of a run is over."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Final
 
-from cosim.spec.scenario import City, Scenario
+import msgspec
+
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, Scenario, Suite
 from scenarios.bench.driving import FourHertz
 from scenarios.bench.figures import Figure
 
@@ -40,6 +45,30 @@ def engines_starting(began_s: float) -> list[Figure]:
     p.connect(p.DIRECT)
     with context():
         return [Figure(ENGINES_ALONE, time.monotonic() - began_s)]
+
+
+def first_episode(began_s: float, of_one_process: Callable[[], Figure]) -> list[Figure]:
+    """Seconds by which the first episode of a local run is over later than in one process alone, each begun fresh; this
+    one at `began_s` of the monotonic clock."""
+    late_s = _first_over_s(began_s, local=True) - of_one_process().value
+    return [Figure("first episode of a local run, later than in one process, s", late_s, reach=1.0)]
+
+
+def first_episode_alone(began_s: float) -> list[Figure]:
+    """Seconds until the first episode of a run in this process alone, begun at `began_s`, is over."""
+    return [Figure("first episode in one process, s", _first_over_s(began_s, local=False))]
+
+
+def _first_over_s(began_s: float, *, local: bool) -> float:
+    """local: driven by a process of its own, as `cosim run` does it; else by this one."""
+    from cosim.policies.load import load_policy
+    from scenarios.catalog import load_suite
+    from scenarios.execution.suite_run import run
+
+    one = msgspec.structs.replace(load_suite("reactive").scenarios[0], time_limit_s=1.0, events=())
+    suite = Suite(name="first", version="1", scenarios=(one,))
+    run(suite, "straight" if local else load_policy("straight").policy, options=EpisodeOptions(seed=1))
+    return time.monotonic() - began_s
 
 
 def _first_frame_s(scenario: Scenario, began_s: float) -> float:
