@@ -101,7 +101,7 @@ class AskEnded(_Signed, frozen=True, tag="ended"):
 
 class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     """Who answers here. source: a hash of the policy's source, "" where that is unknown; at_once: for so many episodes
-    it can answer at a time, 0 for any number; under_way: there are so many; jpeg: it asks for pictures as JPEG."""
+    it can answer at a time, 0 for any number; under_way: there are so many; jpeg: pictures as JPEG; listens: itself."""
 
     server: str
     name: str
@@ -110,6 +110,7 @@ class PolicyInfo(msgspec.Struct, frozen=True, tag="info"):
     at_once: int = 0
     under_way: int = 0
     jpeg: bool = False
+    listens: bool = False
     python: str = platform.python_version()
     protocol: int = POLICY_PROTOCOL
 
@@ -415,7 +416,7 @@ def serve(
 
     def tell(query: Any) -> None:
         with query:
-            info = PolicyInfo(server, name, manifest, source, desk.at_once, desk.under_way, jpeg)
+            info = PolicyInfo(server, name, manifest, source, desk.at_once, desk.under_way, jpeg, bool(listen))
             query.reply(f"{below}/info", encode_asked(info))
 
     opens = nullcontext(session) if session else _opened(listen, connect, tls, insecure)

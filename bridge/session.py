@@ -94,6 +94,11 @@ class Session:
         assert self._inside is not None, "this session listens nowhere"
         return self._inside
 
+    @property
+    def hub(self) -> str:
+        """Which hub this end is connected to now, by an id that no other one has; "" for none."""
+        return ", ".join(str(one) for one in self._session.info.routers_zid())
+
     def serve(self, key: str, handler: Handler, *, found: bool = False) -> None:
         """Answer queries on `key` with `handler(payload)`; its exceptions become error replies.
 

@@ -18,6 +18,8 @@ _ALWAYS: Final[dict[str, object]] = {
     "transport/shared_memory/enabled": False,
     "transport/link/rx/max_message_size": 16 << 20,
 }
+CONNECTS_WITHIN_S: Final = 2.0
+"""So long an end that connects tries to; a hub that has just been started is there sooner."""
 
 
 def settings_alone() -> dict[str, object]:
@@ -31,7 +33,7 @@ def settings_of(connection: Connection, own: Sequence[str] = ()) -> dict[str, ob
         "mode": "router" if connection.listen else "client",
         "listen/endpoints": [connection.listen, *own] if connection.listen else [],
         "connect/endpoints": [connection.connect] if connection.connect else [],
-        "connect/timeout_ms": 2000 if connection.connect else 0,
+        "connect/timeout_ms": round(1000 * CONNECTS_WITHIN_S) if connection.connect else 0,
     }
     if connection.tls:
         folder = Path(connection.tls)

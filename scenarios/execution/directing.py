@@ -92,7 +92,8 @@ def behaviours() -> str:
 def sources(name: str) -> dict[str, bytes]:
     """The source of a module and of all of ours that it imports, however indirectly, by their names."""
     found: dict[str, bytes] = {}
-    _gather(name, found)
+    for each in (name, "cosim.rounding"):  # the second is loaded with any of our rooms
+        _gather(each, found)
     return found
 
 

@@ -13,6 +13,7 @@ environments drive it. The policy stands outside.
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections.abc import Callable, Sequence
@@ -23,7 +24,7 @@ from typing import Self
 import msgspec
 
 from cosim.core.clock import Clock
-from cosim.core.errors import PolicyError, UsageError
+from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.state import Frame
 from cosim.episode.camera_rules import check_camera
 from cosim.episode.control import command_of
@@ -47,6 +48,10 @@ from sumo_nets.crowd.demand_log import Entrances
 
 Watch = Callable[[Step, Verdict], None]
 """Told each Step of an episode, and what the referee says of it."""
+
+
+_engines_ran_in: set[int] = set()
+"""Ids of this process and of those that it was forked from, if engines ran in them."""
 
 
 def unheard(reason: str) -> None:
@@ -113,6 +118,12 @@ class Episode:
     def __enter__(self) -> Self:
         if self._setup_s:
             raise UsageError("this Episode was used before: make a new Episode for every run of a scenario")
+        if _engines_ran_in - {os.getpid()}:
+            raise EngineError(
+                "engines ran in the process that this one was forked from, whose threads are not here: start processes "
+                "by 'forkserver' or 'spawn' (context= of AsyncVectorEnv, start_method= of SubprocVecEnv)"
+            )
+        _engines_ran_in.add(os.getpid())
         with ExitStack() as stack:
             stage = stack.enter_context(
                 staged(self.scenario, self.manifest, self.options, self.clock, self._waiting, self._kinds)

@@ -84,13 +84,14 @@ class LostRenderer(msgspec.Struct, frozen=True, tag=True):
 
 class Done(msgspec.Struct, frozen=True, tag=True):
     """The episode is over. record, log: the bytes of its files, as `encoded` by Record and Log; a crash has no log.
-    again: see `Outcome`."""
+    again: see `Outcome`. demonstration: what is kept of it where demonstrations are collected, if anything."""
 
     scenario: str
     status: Status
     record: bytes = b""
     log: bytes = b""
     again: bool = False
+    demonstration: bytes = b""
 
 
 Message = Ready | Unable | Progress | Waits | Compares | FrameDrawn | LostRenderer | Done

@@ -12,7 +12,7 @@ episode is written here, by the run's own process.
 from __future__ import annotations
 
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Sequence
 from functools import partial
 from logging import ERROR, WARNING
@@ -25,7 +25,7 @@ from cosim.core.errors import MachineError, RunError, UsageError
 from cosim.core.journal import happened
 from cosim.episode.given import with_goal
 from cosim.records.record import Record, Status, begun
-from cosim.records.run_folder import RunFolder
+from cosim.records.run_folder import FailedAttempt, RunFolder
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.pseudonym import pseudonym_of
 from cosim.spec.scenario import Scenario
@@ -66,17 +66,19 @@ def run_all(
     options = msgspec.structs.replace(options, seed=folder.spec.seed)
     pool = _Pool(folder, hello, transport, options, tell, patience, renderer)
     waiting = deque(sorted(scenarios, key=partial(pseudonym_of, folder.spec.seed)))
-    attempts: Counter[tuple[str, bool]] = Counter()
+    attempts = folder.failed_attempts()
     happened("run begun", episodes=len(scenarios), policy=hello.policy, folder=str(folder.path))
     try:
         while waiting or pool.busy:
             while waiting and transport.room(len(pool.busy)) > 0:
                 pool.give(waiting.popleft())
             for lost in pool.listen():
-                so_far, most = (lost.scenario.id, lost.away), LOSSES if lost.away else ATTEMPTS
-                attempts[so_far] += bool(lost.why)
-                if attempts[so_far] < most:
-                    tried = attempts[so_far]
+                attempt, most = FailedAttempt(lost.scenario.id, lost.away), LOSSES if lost.away else ATTEMPTS
+                if lost.why:
+                    attempts[attempt] += 1
+                    folder.keep_failed_attempt(attempt)
+                if not lost.why or attempts[attempt] < most:
+                    tried = attempts[attempt]
                     happened("retried", WARNING, scenario=lost.scenario.id, why=lost.why, attempts=tried, of=most)
                     waiting.appendleft(lost.scenario)
                 else:
@@ -258,7 +260,7 @@ class _Pool:
         elif done.again:
             self._again.append(_Lost(scenario, record.reason, in_engine=record.status == "invalid"))
         else:
-            self._folder.keep(record, done.log)
+            self._folder.keep(record, done.log, done.demonstration)
             self._over(scenario, record.status)
 
     def _record_of(self, scenario: Scenario, done: Done) -> Record | None:

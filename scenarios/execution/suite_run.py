@@ -1,10 +1,13 @@
-"""run(suite, policy) -> table: a suite run from Python, in this process or in several, into a run folder or none."""
+"""run(suite, policy) -> table: a suite run from Python, in this process or in several, into a run folder or none.
+
+What the command line does with options goes the same way: a run is planned, its folder held, what is left of it run.
+"""
 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,10 +33,11 @@ from physics.cameras.choice import renderer_of
 from physics.robots import hash_of_robot
 from scenarios.builders.fits import check_places
 from scenarios.catalog import load_suite, scenarios_chosen, with_robot
+from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hear, Hello
 from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
-from scenarios.execution.transport import InProcess, Transport
+from scenarios.execution.transport import HeldRun, InProcess, Reaches
 from scenarios.rendering.shared import SharedRenderer, check_shared
 from scenarios.serving.drivers import known_driver
 
@@ -49,7 +53,9 @@ def run(
     episodes: int | None = None,
     scenarios: Sequence[str] = (),
     events: Sequence[str] = (),
-    jobs: int = 1,
+    shard: str = "",
+    jobs: int | None = None,
+    on: str = "",
     out: str | Path | None = None,
     resume: bool = False,
     shared_renderer: bool = False,
@@ -60,8 +66,10 @@ def run(
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
 
     suite: one that was loaded, or a name or path as for `load_suite`. policy: an object, which drives in this process,
-    one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes that
-    survive whatever it does. episodes, scenarios, events: run only the first so many, these ids, these kinds of events.
+    one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes (one)
+    that survive whatever it does; or, with `on` ("ray", "auto", "ray://HOST:10001"), in those of a Ray cluster, as many
+    as it has CPUs. episodes, scenarios, events: run only the first so many, these ids, these kinds of events. shard:
+    only a part of that, as "1/4", of a run with a seed: `cosim merge` makes one of all.
     out: the run folder, to be kept and resumed; without one only the table is. shared_renderer: one process draws for
     all the others and, if the policy has `act_batch`, asks it (`BatchPolicy`). host: where a named policy is asked:
     `PolicyHost(isolated=True)` gives it a process of its own. options: without a seed one is drawn anew, or taken from
@@ -74,37 +82,129 @@ def run(
     >>> run("reactive", "straight", scenarios=["obstructing-001"])[["scenario", "success"]].to_dict("records")
     [{'scenario': 'obstructing-001', 'success': 0.0}]
     """
-    if not isinstance(policy, str) and (jobs != 1 or shared_renderer or host.isolated):
-        asked = f"jobs={jobs}" if jobs != 1 else "host" if host.isolated else "shared_renderer=True"
+    needs = {f"jobs={jobs}": jobs not in (None, 1), f"on='{on}'": on != "", "host": host.isolated}
+    asked = next((words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared_renderer)
+    if asked and not isinstance(policy, str):
         raise UsageError(
             f"{asked} needs a policy by its name, such as 'package.module:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
+    if on:
+        from scenarios.many.on_ray import by_ray, check_on_ray
+
+        of_here = {"shared_renderer": shared_renderer, "real_time": options.real_time, "live": options.live}
+        check_on_ray(on, of_here)
     whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
-    picked = scenarios_chosen(whole, scenarios, episodes, events)
-    check_places(whole, picked)
+    of_run = scenarios_chosen(whole, scenarios, episodes, events)
+    folder = None if out is None else Path(out)
+    plan = planned_run(
+        whole, of_run, policy, options, shard=shard, jobs=1 if on else jobs or 1, shared_renderer=shared_renderer,
+        host=host, resumed=folder if resume else None,
+    )  # fmt: skip
+    check_places(whole, plan.picked)
+    with ExitStack() as stack:
+        if on:
+            reaches = stack.enter_context(by_ray(on, jobs, plan.policy, _untold))
+        else:
+            reaches = by_processes(jobs or 1) if isinstance(policy, str) else in_this_process(plan.driver)
+        folder = folder or Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
+        held = stack.enter_context(held_run(plan, folder, resume=resume))
+        run_what_is_left(plan, held, reaches, tell)
+        return held.held.finish()
+
+
+class PlannedRun(NamedTuple):
+    """What is to be run. of_run: of the suite `whole`; shard: which part of that, where not all; policy: its name;
+    driver: it, as it was loaded here; options: with the run's seed and camera; shared_renderer: whether one process
+    draws for all the others."""
+
+    whole: Suite
+    of_run: Sequence[Scenario]
+    shard: Shard | None
+    policy: str
+    driver: Driver
+    options: EpisodeOptions
+    host: PolicyHost
+    patience: Patience
+    shared_renderer: bool
+
+    @property
+    def picked(self) -> Sequence[Scenario]:
+        """What is run of it here."""
+        return self.of_run if self.shard is None else self.shard.share(self.of_run)
+
+    @property
+    def spec(self) -> RunSpec:
+        """What it is, for its folder. Raises UsageError."""
+        return run_spec(
+            self.whole, self.of_run, self.policy, self.driver, self.options, self.shared_renderer, self.shard
+        )
+
+
+def planned_run(
+    whole: Suite,
+    of_run: Sequence[Scenario],
+    policy: Policy | str,
+    options: EpisodeOptions,
+    *,
+    shard: str = "",
+    jobs: int = 1,
+    shared_renderer: bool = False,
+    host: PolicyHost = PolicyHost(),  # noqa: B008  a frozen value
+    patience: Patience = Patience(),  # noqa: B008  a frozen value
+    resumed: Path | None = None,
+) -> PlannedRun:
+    """A run, once its policy is loaded and its seed drawn; its places have not been looked at. shard: "1/4"; resumed:
+    the folder of the run that it goes on with. Raises UsageError, MachineError."""
+    part = Shard.called(shard, len(of_run)) if shard else None
+    if part is not None and options.seed is None and resumed is None:
+        raise UsageError("--shard needs --seed: shards are of one run, which has one seed: give the same to each")
     driver = known_driver(policy, host, jobs) if isinstance(policy, str) else Driver.of(policy)
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
-    options = _settled(options, whole, driver, seed_of_run(options.seed, Path(out) if resume and out else None))
+    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
+    seed = seed_of_run(options.seed, resumed)
+    options = msgspec.structs.replace(options, seed=seed, suite_hash=whole.content_hash, camera=camera)
     check_alone(options, jobs, shared_renderer)
-    asks = shared_renderer and check_shared(driver, chosen_camera(options.camera))
-    spec = run_spec(whole, picked, name, driver, options, shared_renderer)
-    with ExitStack() as stack:
-        folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory())) / "run"
-        held = RunFolder.resume(folder, spec) if resume else RunFolder.create(folder, spec, whole)
-        stack.enter_context(held)
+    if shared_renderer:
+        check_shared(driver, camera)
+    return PlannedRun(whole, of_run, part, name, driver, options, host, patience, shared_renderer)
+
+
+@contextmanager
+def held_run(plan: PlannedRun, folder: Path, *, resume: bool) -> Iterator[HeldRun]:
+    """The run in its folder, begun there, or to be gone on with. Raises RunError for a folder of another run."""
+    held = RunFolder.resume(folder, plan.spec) if resume else RunFolder.create(folder, plan.spec, plan.whole)
+    hello = Hello(plan.policy, plan.driver.manifest, plan.driver.source_hash, host=plan.host)
+    with held:
         done = held.finished()
-        todo = [scenario for scenario in picked if scenario.id not in done]
-        if isinstance(policy, str):
-            transport: Transport = LocalProcesses(held.path / "logs", jobs)
-        else:
-            transport = InProcess(driver)
-        hello = Hello(name, driver.manifest, driver.source_hash, host=host)
+        yield HeldRun(held, hello, plan.patience, plan.picked, [one for one in plan.picked if one.id not in done])
+
+
+def run_what_is_left(plan: PlannedRun, run: HeldRun, reaches: Reaches, tell: Hear) -> None:
+    """Run what is to be run of it, by workers that are reached so. Raises MachineError, UsageError."""
+    if not run.todo:
+        return
+    with ExitStack() as stack:
         renderer = None
-        if shared_renderer and todo:
-            renderer = stack.enter_context(SharedRenderer(held.path / "logs", hello, asks=asks))
-        run_all(held, todo, hello, transport, tell=tell, options=options, renderer=renderer)
-        return held.finish()
+        if plan.shared_renderer:
+            asks = check_shared(plan.driver, chosen_camera(plan.options.camera))
+            drawing = SharedRenderer(run.held.path / "logs", run.hello, asks=asks, patience=run.patience)
+            renderer = stack.enter_context(drawing)
+        transport, tell = stack.enter_context(reaches(run, tell))
+        run_all(
+            run.held, run.todo, run.hello, transport, tell=tell, options=plan.options, patience=run.patience,
+            renderer=renderer,
+        )  # fmt: skip
+
+
+def by_processes(jobs: int) -> Reaches:
+    """Workers that are so many processes of this machine."""
+    return lambda run, tell: nullcontext((LocalProcesses(run.held.path / "logs", jobs), tell))
+
+
+def in_this_process(driver: Driver) -> Reaches:
+    """This process is the worker."""
+    return lambda run, tell: nullcontext((InProcess(driver), tell))
 
 
 def run_spec(
@@ -189,9 +289,3 @@ def seed_of_run(asked: int | None, resumed: Path | None) -> int:
     if asked is not None:
         return asked
     return drawn_seed() if resumed is None else read_spec(resumed).seed
-
-
-def _settled(options: EpisodeOptions, whole: Suite, driver: Driver, seed: int) -> EpisodeOptions:
-    """Options with the run's seed, the suite's hash and the one camera of the run."""
-    camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
-    return msgspec.structs.replace(options, seed=seed, suite_hash=whole.content_hash, camera=camera)

@@ -7,11 +7,14 @@ so that a worker needs no folder of the run's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from typing import Literal, NamedTuple, Protocol
 
 from cosim.episode.driver import Driver
-from scenarios.execution.asked import Question
+from cosim.records.run_folder import RunFolder
+from cosim.spec.scenario import Scenario
+from scenarios.execution.asked import Patience, Question
 from scenarios.execution.messages import Done, Hear, Hello, Job
 from scenarios.execution.worker import run_job
 
@@ -85,6 +88,21 @@ class Transport(Protocol):
 
     def wait(self, timeout_s: float) -> None:
         """Until a worker that has not ended may have something to tell, or the time is over."""
+
+
+class HeldRun(NamedTuple):
+    """A run whose folder is held. hello: its policy; patience: with that; picked: its scenarios, of a shard those of
+    that; todo: what of these is to be run."""
+
+    held: RunFolder
+    hello: Hello
+    patience: Patience
+    picked: Sequence[Scenario]
+    todo: Sequence[Scenario]
+
+
+Reaches = Callable[[HeldRun, Hear], AbstractContextManager[tuple[Transport, Hear]]]
+"""How workers are reached for a run, and what is to be told of their episodes in place of what was to be."""
 
 
 class InProcess:

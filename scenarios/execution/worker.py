@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from socket import socket
@@ -51,7 +52,7 @@ CANNOT_START = "an environment process cannot start:"
 def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
     """Serve jobs until the socket closes. An exception outside an episode ends the process; its run starts another."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    wire, home = Wire(socket(fileno=socket_descriptor)), Path.cwd()
+    wire, home, printed_to = Wire(socket(fileno=socket_descriptor)), Path.cwd(), _printed_to()
     say = partial(said_to_run, wire, os.getpid())
     hello = decode_hello(wire.receive())
     _import_engines(say)
@@ -70,10 +71,22 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
         except MachineError as lack:
             say(Unable(str(lack), blames_policy=False))
             raise
-        if trouble:
+        if trouble or driver.spent:
             driver.close()
             driver = None  # made anew for the next one
         say(done)
+        if _printed_to() != printed_to:
+            return  # the policy has closed it: what was opened since may have its number, and would be written into
+
+
+def _printed_to() -> list[tuple[int, int]]:
+    """What standard output and standard error are; without what is closed."""
+    found = []
+    for descriptor in (1, 2):
+        with suppress(OSError):
+            what = os.fstat(descriptor)
+            found.append((what.st_dev, what.st_ino))
+    return found
 
 
 def _import_engines(say: Hear) -> None:
@@ -99,7 +112,10 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
     try:
         driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
         if driver.source_hash != hello.source_hash:
-            raise UsageError(f"policy '{hello.policy}' was edited while the run was going on: begin another run")
+            raise UsageError(
+                f"policy '{hello.policy}' was edited while the run was going on: begin another run. Or it is a network "
+                "on another kind of processor than the run's, which answers otherwise in the last bit"
+            )
         if again:
             driver.manifest = hello.manifest
         if driver.manifest != hello.manifest:
@@ -116,18 +132,20 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
 def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
     printed, because a record holds the message alone."""
+    from scenarios.collecting.demonstrator import Demonstrator
     from scenarios.execution.places import check_place
     from scenarios.execution.run import run_episode
 
     if job.net_hash:
         check_place(job.scenario.place, job.net_hash)
-    name = job.scenario.id
+    name, collecting = job.scenario.id, job.options.collecting
+    expert = None if collecting is None else Demonstrator(driver, collecting, job.options.goal)
     try:
         if (shared := job.options.renderer) is not None:
             link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))
         outcome = run_episode(
             job.scenario,
-            driver,
+            expert or driver,
             job.options,
             watches=[_watcher(job, say)],
             waiting=lambda reason: say(Waits(name, reason)),
@@ -138,7 +156,8 @@ def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, b
     if outcome.traceback:
         print(f"--- {name}\n{outcome.traceback}", file=sys.stderr, flush=True)
     log = b"" if outcome.log is None else outcome.log.encoded()
-    done = Done(name, outcome.record.status, outcome.record.encoded(), log, outcome.again)
+    shown = b"" if expert is None else expert.kept(job.scenario, outcome.record, outcome.log)
+    done = Done(name, outcome.record.status, outcome.record.encoded(), log, outcome.again, shown)
     return done, bool(outcome.traceback)
 
 

@@ -64,7 +64,7 @@ class PlannedBlow(NamedTuple):
 
 
 class UnderFire(NamedTuple):
-    """What came out: episodes, faults that happened, seconds, and what was wrong, in words."""
+    """What came out: episodes, faults that happened, seconds, and why it did not come to its end, in words."""
 
     episodes: int
     faults: Counter[str]
@@ -81,8 +81,8 @@ def planned_blows(episodes: int, seed: int) -> list[PlannedBlow]:
     return sorted([*planned, *apart])
 
 
-def quiet(folder: Path, episodes: int, jobs: int) -> Path:
-    """The run that chaos is held against, in `folder`, with the suite of both. Returns its run folder."""
+def tiny_suite(folder: Path, episodes: int) -> None:
+    """Write the suite of all runs in `folder`, and what its poison is called before the policy."""
     one = small_scenario()
     suite = Suite(
         name="chaos", version="1",
@@ -93,6 +93,10 @@ def quiet(folder: Path, episodes: int, jobs: int) -> Path:
     write_suite(suite, folder / "suite.json")
     poison = pseudonym_of(_SEED, suite.scenarios[episodes // 2]).episode
     (folder / "poison").write_text(poison)
+
+
+def quiet(folder: Path, jobs: int) -> Path:
+    """The run that chaos is held against, of the suite in `folder`. Returns its run folder."""
     done = subprocess.run(_command(folder, "run", "quiet", "--jobs", str(jobs)), env=_env(folder), check=False,
                           capture_output=True, text=True)  # fmt: skip
     if done.returncode != 1:  # the poison crashes
@@ -103,7 +107,7 @@ def quiet(folder: Path, episodes: int, jobs: int) -> Path:
 def chaos(
     folder: Path, name: str, workers: int, planned: Sequence[PlannedBlow], seed: int, *, replaced: bool = True
 ) -> UnderFire:
-    """Run the suite in `folder` again, by `workers` workers and with faults, into the run folder `name` there.
+    """Run the suite in `folder` by `workers` workers and with faults, into the run folder `name` there.
 
     replaced: who is gone is replaced by another worker."""
     run, began_s, happened = folder / name, time.monotonic(), Counter[str]()
@@ -120,8 +124,7 @@ def chaos(
                 if crew.suffer(fault, draw):
                     happened[left.pop(0).fault] += 1
             time.sleep(_POLL_S)
-    wrong = _wrong(folder / "quiet", run)
-    return UnderFire(len(read_records(run)), happened, time.monotonic() - began_s, wrong)
+    return UnderFire(len(read_records(run)), happened, time.monotonic() - began_s, [])
 
 
 class _Crew:
@@ -220,8 +223,8 @@ def _children(pid: int) -> list[int]:
     return found
 
 
-def _wrong(reference: Path, run: Path) -> list[str]:
-    """What is wrong with a run, in words."""
+def differences(reference: Path, run: Path) -> list[str]:
+    """What is wrong with a run, held against a quiet one, in words."""
     wrong = []
     quiet_csv, csv = ((one / "results.csv").read_bytes() for one in (reference, run))
     if quiet_csv != csv:
@@ -245,14 +248,16 @@ def _main() -> int:
     folder = (given.folder or Path(tempfile.mkdtemp(prefix="cosim-chaos-"))).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     began_s = time.monotonic()
-    quiet(folder, given.episodes, given.workers)
+    tiny_suite(folder, given.episodes)
+    reference = quiet(folder, given.workers)
     print(f"quiet run: {time.monotonic() - began_s:.0f} s", flush=True)
     wrong = 0
     for seed in range(given.first, given.first + given.seeds):
         found = chaos(folder, f"chaos-{seed}", given.workers, planned_blows(given.episodes, seed), seed)
-        wrong += bool(found.wrong)
+        faulty = found.wrong or differences(reference, folder / f"chaos-{seed}")
+        wrong += bool(faulty)
         faults = ", ".join(f"{count} x {fault}" for fault, count in sorted(found.faults.items()))
-        ends = "; ".join(found.wrong) or "as in the quiet run to the byte"
+        ends = "; ".join(faulty) or "as in the quiet run to the byte"
         print(f"seed {seed}: {found.episodes} episodes in {found.wall_s:.0f} s, {faults}: {ends}", flush=True)
     return int(wrong > 0)
 

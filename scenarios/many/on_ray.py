@@ -11,7 +11,7 @@ import os
 import signal
 import sysconfig
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +24,7 @@ from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Place
 from scenarios.execution.asked import Question
 from scenarios.execution.messages import Done, Hear, Hello, Job, decode_message, encode_message
+from scenarios.execution.transport import HeldRun, Reaches, Transport
 from scenarios.many.nets import Nets, travels
 from scenarios.many.ray_actor import EnvironmentActor, Heard, NodeFound, ProcessEnd
 from scenarios.many.words import Asks, NetAsked, NetPart, installed_here
@@ -47,6 +48,29 @@ def check_ray(on: str) -> Any:
     except ImportError:
         raise UsageError(f"--on {on} needs Ray, here and on each node: pip install 'sidewalk-cosim[ray]'") from None
     return ray
+
+
+def check_on_ray(on: str, of_here: Mapping[str, object]) -> None:
+    """Raises UsageError without Ray, for what is no cluster's name, and where something is asked for that is of
+    processes of this machine. of_here: what is, by its name."""
+    check_ray(on)
+    for name in (name for name, asked in of_here.items() if asked):
+        raise UsageError(f"{name} is of processes of this machine, and these are of a cluster: leave it, or that, out")
+
+
+@contextmanager
+def by_ray(on: str, jobs: int | None, policy: str, say: _Say) -> Iterator[Reaches]:
+    """A connection to a cluster, as for `ray_cluster`, and how its workers are reached: so many `jobs`, or None for as
+    many as it has CPUs."""
+
+    @contextmanager
+    def reached(run: HeldRun, tell: Hear) -> Iterator[tuple[Transport, Hear]]:
+        workers = RayWorkers(run.held.spec, run.held.path / "logs", jobs, len(run.todo), say)
+        say(f"{workers.wanted} workers on Ray")
+        yield workers, tell
+
+    with ray_cluster(on, policy, say):
+        yield reached
 
 
 @contextmanager

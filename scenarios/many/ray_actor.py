@@ -6,12 +6,11 @@ on one machine, and what takes that down or hangs in it is told by the actor as 
 
 from __future__ import annotations
 
-import shutil
 import socket
-import tempfile
 import threading
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +19,7 @@ from cosim.core.errors import CosimError
 from cosim.spec.scenario import CityMap, Place
 from scenarios.execution.messages import Message, Unable, encode_message
 from scenarios.execution.process import WORKER, KeptProcess
+from scenarios.many.passing_folder import passing_folder
 from scenarios.many.words import Asks, Installed, installed_here
 
 
@@ -51,8 +51,9 @@ class EnvironmentActor:
     """One environment process. Its methods are called by the run, `hear` beside the others."""
 
     def __init__(self) -> None:
-        self._logs = Path(tempfile.mkdtemp(prefix="cosim-ray-"))
-        self._process = KeptProcess(self._logs / "process.log", WORKER, "environment")
+        self._folder = ExitStack()
+        logs = self._folder.enter_context(passing_folder("cosim-ray-"))
+        self._process = KeptProcess(logs / "process.log", WORKER, "environment")
         self._turn = threading.Lock()
         self._open = True
         self._trouble: list[Message] = []
@@ -101,7 +102,7 @@ class EnvironmentActor:
             self._open = False
             words = self._process.end()
             printed = Path(self._process.log).read_bytes()
-            shutil.rmtree(self._logs, ignore_errors=True)
+            self._folder.close()
             return ProcessEnd(words, self._process.in_engine, self._asks(), printed)
 
     def _asks(self) -> Asks | None:

@@ -12,7 +12,6 @@ import secrets
 import select
 import signal
 import socket
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -22,8 +21,9 @@ from typing import Final
 
 from bridge import keys
 from bridge.session import Session, open_session
-from cosim.core.errors import CosimError, EngineError
+from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.spec.connection import Connection
+from scenarios.many.passing_folder import passing_folder
 from scenarios.many.slot import NET, RunEnded, Wish, WorkSlot
 from scenarios.many.words import installed_here, reply_in
 
@@ -34,6 +34,9 @@ _LOOKS_S: Final = 5.0
 _PARTING_S: Final = 10.0
 """How long a worker that leaves goes on trying to hand over what it has."""
 _TELLING_S: Final = 2.0
+GIVEN_UP_S: Final = 600.0
+"""A worker that is there for one run ends when it has heard of none for so long: that it is over may have been told
+when nobody could hear it."""
 Say = Callable[[str], None]
 
 
@@ -79,13 +82,15 @@ def work(connection: Connection, jobs: int, say: Say, *, once: bool = False, log
     `once` until one is over. Returns the number of the signal that asked, 0 if none did.
 
     logs: the folder for what processes print, by default one that is gone afterwards. say: what to tell the user, a
-    line each. Raises UsageError when the run refuses this worker, MachineError when no episode can be run here."""
+    line each. Raises UsageError when the run refuses this worker, MachineError when no episode can be run here, or with
+    `once` when no run is heard of any more."""
     with ExitStack() as stack:
         leaving = stack.enter_context(_signals_heard())
         if logs is None:
-            logs = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cosim-worker-")))
+            logs = stack.enter_context(passing_folder("cosim-worker-"))
         logs.mkdir(parents=True, exist_ok=True)
-        session = _reached(connection, leaving, say)
+        heard = _Heard(connection.endpoint, once)
+        session = _reached(connection, leaving, heard, say)
         if session is None:
             return leaving.signal
         stack.enter_context(session)
@@ -96,20 +101,41 @@ def work(connection: Connection, jobs: int, say: Say, *, once: bool = False, log
                 if not told:
                     say(f"waits for a run at {connection.endpoint}")
                 told = True
+                heard.look()
                 leaving.wait([], _RETRY_S)
                 continue
             told = False
-            if _Service(session, connection, runs[0], jobs, logs, leaving, say).serve():
+            if _Service(session, connection, runs[0], jobs, logs, leaving, heard, say).serve():
                 if once:
                     return 0
                 over, over_s = runs[0], time.monotonic()
         return leaving.signal
 
 
-def _reached(connection: Connection, leaving: Leaving, say: Say) -> Session | None:
+class _Heard:
+    """When something was heard of a run. once: whether it is waited for no longer than GIVEN_UP_S."""
+
+    def __init__(self, endpoint: str, once: bool) -> None:
+        self._endpoint, self._once = endpoint, once
+        self.now()
+
+    def now(self) -> None:
+        self._at_s = time.monotonic()
+
+    def look(self) -> None:
+        """Raises MachineError when nothing was for too long."""
+        if self._once and time.monotonic() - self._at_s > GIVEN_UP_S:
+            raise MachineError(
+                f"no run was heard of at {self._endpoint} for {GIVEN_UP_S:g} s: is it over? Without --once a worker "
+                "waits for the next one"
+            )
+
+
+def _reached(connection: Connection, leaving: Leaving, heard: _Heard, say: Say) -> Session | None:
     """A session with the coordinator, waited for; None when asked to leave before that. Raises AccessError."""
     told = False
     while not leaving.signal:
+        heard.look()
         try:
             return open_session(connection, say)
         except EngineError:
@@ -124,16 +150,17 @@ class _Service:
     """For one run."""
 
     def __init__(
-        self, session: Session, reach: Connection, run: str, jobs: int, logs: Path, leaving: Leaving, say: Say
-    ) -> None:
-        self._session, self._run, self._leaving, self._say = session, run, leaving, say
+        self, session: Session, reach: Connection, run: str, jobs: int, logs: Path, leaving: Leaving, heard: _Heard,
+        say: Say,
+    ) -> None:  # fmt: skip
+        self._session, self._run, self._leaving, self._heard, self._say = session, run, leaving, heard, say
         host = socket.gethostname()
         self._name = keys.chunk(f"{host[:40]}-{os.getpid()}-{secrets.token_hex(3)}")
         installed = installed_here()
         self._slots = [WorkSlot(self._name, number, host, installed, logs, reach) for number in range(jobs)]
         self._replies: queue.SimpleQueue[tuple[WorkSlot | None, str, bytes | None, str]] = queue.SimpleQueue()
-        self._heard_s = time.monotonic()
-        self._looking, self._quiet, self._told = False, False, ""
+        self._looks_s = time.monotonic() + _LOOKS_S
+        self._quiet, self._told = False, ""
 
     def serve(self) -> bool:
         """Until the run is over (True), another one is at its place, or this process is asked to leave."""
@@ -184,7 +211,8 @@ class _Service:
 
     def _take(self, slot: WorkSlot | None, act: str, payload: bytes | None, error: str) -> None:
         if payload is not None:
-            self._heard_s = time.monotonic()
+            self._heard.now()
+            self._looks_s = time.monotonic() + _LOOKS_S
             if self._quiet:
                 self._say("the coordinator is there again")
             self._quiet = False
@@ -198,11 +226,12 @@ class _Service:
 
     def _other_run(self) -> bool:
         """Whether another run is to be found where this one was; looked for when nothing is heard of it."""
-        if time.monotonic() - self._heard_s < _LOOKS_S:
+        if time.monotonic() < self._looks_s:
             return False
+        self._heard.look()
         if not self._quiet:
             self._say("the coordinator does not answer: waits for it")
-        self._quiet, self._heard_s = True, time.monotonic() - _LOOKS_S + 1.0
+        self._quiet, self._looks_s = True, time.monotonic() + 1.0
         runs = [key.split("/")[1] for key in self._session.answers(keys.EVERY_RUN, timeout_s=2.0)]
         return bool(runs) and self._run not in runs
 

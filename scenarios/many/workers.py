@@ -8,7 +8,7 @@ from __future__ import annotations
 import queue
 import secrets
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import Final, NamedTuple
 
@@ -18,12 +18,10 @@ from bridge import keys
 from bridge.codec import decode
 from bridge.session import Query, Session
 from cosim.core.errors import EngineError
-from cosim.records.run_folder import RunFolder
 from cosim.records.run_spec import RunSpec
-from cosim.spec.scenario import Scenario
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Done, Hear, Hello, Job
-from scenarios.execution.transport import GoesOn, Late, Reception
+from scenarios.execution.transport import GoesOn, HeldRun, Late, Reception
 from scenarios.many.leased import LEASE_S, LeasedWorker
 from scenarios.many.nets import Nets
 from scenarios.many.roll import Roll
@@ -302,24 +300,14 @@ class _Told(msgspec.Struct):
 
 @contextmanager
 def workers_of_run(
-    session: Session,
-    held: RunFolder,
-    todo: Sequence[Scenario],
-    picked: Sequence[Scenario],
-    hello: Hello,
-    patience: Patience,
-    tell: Hear,
-    *,
-    resumed: bool,
+    session: Session, run: HeldRun, tell: Hear, *, resumed: bool
 ) -> Iterator[tuple[RemoteWorkers, Hear]]:
-    """The workers of a run, whose folder is held, and what is to be told of their episodes in place of `tell`.
-
-    todo: what of the run, which is `picked`, is to be run. At the end of the block, unless it failed, workers are told
-    that the run is over."""
-    roll = Roll(held, picked, len(picked) - len(todo), tell)
-    workers = RemoteWorkers(session, held.spec, hello, patience, roll, resumed=resumed)
+    """The workers of a run, and what is to be told of their episodes in place of `tell`. At the end of the block,
+    unless it failed, they are told that the run is over."""
+    roll = Roll(run.held, run.picked, len(run.picked) - len(run.todo), tell)
+    workers = RemoteWorkers(session, run.held.spec, run.hello, run.patience, roll, resumed=resumed)
     workers.open()
-    roll.note(f"run {workers.run}: {len(todo)} of {len(picked)} episodes to be run")
+    roll.note(f"run {workers.run}: {len(run.todo)} of {len(run.picked)} episodes to be run")
     yield workers, roll.tell
     roll.note("the run is over")
     workers.part()

@@ -9,7 +9,7 @@ from __future__ import annotations
 import secrets
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext
 from typing import Any, Protocol
 
 import numpy as np
@@ -41,13 +41,14 @@ class QuestionCarrier(Protocol):
 
 class HostedPolicy:
     """A policy elsewhere, as one that can be asked here. run: signs what is asked. took_ms: each answer of the
-    episode."""
+    episode. lost: whether nobody was there any more when an episode had ended."""
 
     def __init__(self, manifest: Manifest, carrier: QuestionCarrier, run: str) -> None:
         self.manifest, self._carrier, self._run = manifest, carrier, run
         self._sign = run, "", ""
         self._step = -1
         self.took_ms: list[float] = []
+        self.lost = False
 
     def reset(self, episode_id: str, seed: int) -> None:
         self._sign = self._run, episode_id, secrets.token_hex(8)
@@ -73,8 +74,10 @@ class HostedPolicy:
 
     def tell_ended(self) -> None:
         """Nothing more is asked about the episode. Whatever goes wrong with that changes nothing."""
-        with suppress(PolicyError, PolicyServerLost):
+        try:
             self._carrier.ask(AskEnded(*self._sign))
+        except (PolicyError, PolicyServerLost):
+            self.lost = True
 
     def close(self) -> None:
         self._carrier.close()
@@ -108,8 +111,14 @@ class HostedDriver(Driver):
 
     def ended(self) -> None:
         if self._begun:
-            self._hosted.tell_ended()
+            # What is elsewhere is waited for a moment only, by itself.
+            with self._asked("ended", 0) if self.runs == "isolated" else nullcontext():
+                self._hosted.tell_ended()
         self._begun = ""
+
+    @property
+    def spent(self) -> bool:
+        return self.runs == "isolated" and self._hosted.lost
 
     def close(self) -> None:
         self._hosted.close()

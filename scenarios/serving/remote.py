@@ -50,14 +50,25 @@ _FIRST_FOUND_WITHIN_S: Final = 10.0
 _LOST_AFTER_S: Final = 3.0
 """A server that nobody has heard of for so long is gone: a link that was cut is taken up again sooner."""
 _TRY_S: Final = 5.0
+_TOLD_WITHIN_S: Final = 1.0
+"""So long it is waited for the word that the end of an episode was heard: it may be busy, or hang."""
 _PAUSE_S: Final = 0.05
 _QUALITY: Final = 90
 """Of JPEG."""
 
 
 class _Server(NamedTuple):
+    """hub: who it is reached by; "" where that is not itself."""
+
     session: Session
     info: PolicyInfo
+    hub: str
+
+    @property
+    def replaced(self) -> bool:
+        """Whether another one listens where it did. A link to one that has gone may be seen a moment longer."""
+        known, now = ({*hub.split(", ")} - {""} for hub in (self.hub, self.session.hub))
+        return bool(known and now) and known.isdisjoint(now)
 
 
 class PolicyServers:
@@ -100,17 +111,18 @@ class PolicyServers:
 
     def ask(self, question: PolicyQuestion) -> Begun | Answer | Refusal:
         assert self._server is not None
-        session, info = self._server
+        session, info, _ = self._server
         kind = str(question.__struct_config__.tag)
         key, payload = f"{policy_key(DOMAIN, self.name, info.server)}/{kind}", encode_asked(question)
         heard_s = time.monotonic()
+        to_end = kind == "ended"
         while True:
-            heard = session.ask_once(key, payload, timeout_s=_TRY_S)
+            heard = session.ask_once(key, payload, timeout_s=_TOLD_WITHIN_S if to_end else _TRY_S)
             if heard.how in ("answered", "refused"):
                 return self._read(heard.payload, question)
-            if heard.how == "late":
+            if heard.how == "late" and not to_end:
                 heard_s = time.monotonic()
-            elif kind == "ended" or time.monotonic() - heard_s > _LOST_AFTER_S:
+            elif to_end or self._server.replaced or time.monotonic() - heard_s > _LOST_AFTER_S:
                 raise PolicyServerLost(f"the server {info.server} of policy '{self.name}' is gone")
             else:
                 time.sleep(_PAUSE_S)
@@ -147,7 +159,8 @@ class PolicyServers:
                     session = self._sessions[endpoint.endpoint]
                     told = session.answers(key, timeout_s=2.0)
                     infos = [_info(payload) for payload in told.values()]
-                    found += [_Server(session, info) for info in infos if info is not None]
+                    hub = session.hub
+                    found += [_Server(session, info, hub * info.listens) for info in infos if info is not None]
             if found:
                 return sorted(found, key=lambda one: one.info.server)
             if time.monotonic() > until_s:

@@ -46,6 +46,14 @@ class Dying(Steady):
         return answer
 
 
+class Stuck(Steady):
+    """Never answers a question."""
+
+    def act(self, seen):
+        Path("asked").touch()
+        time.sleep(3600)
+
+
 if __name__ == "__main__":
     from policy_server import serve
 

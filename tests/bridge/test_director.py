@@ -12,9 +12,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from bridge import keys
+from bridge import director, keys
 from bridge.codec import decode, encode
 from bridge.director import QueryParts, RemoteDirector, opened_query, serve_director, signed, signed_query
+from bridge.security import settings
 from bridge.session import LoneSession
 from cosim.core.errors import DirectorLost, EngineError, SpecError
 from cosim.core.state import PersonKind
@@ -201,8 +202,9 @@ def test_one_director_answers_every_run_and_episode(tmp_path: Path) -> None:
             client.ask(keys.director("a", "x").replace("a", "*", 1), signed_query(query(), ""), timeout_s=PATIENCE_S)
 
 
-def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path) -> None:
-    """Once, after two seconds; the director that comes then is taken."""
+def test_whoever_runs_the_episode_is_told_what_it_waits_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, after a while; the director that comes then is taken."""
+    monkeypatch.setattr(director, "NOTICE_S", 0.1)
     told: list[str] = []
     with listening_at(endpoint(tmp_path)) as hub, connected_to(endpoint(tmp_path)) as client:
 
@@ -236,8 +238,9 @@ def test_a_wildcard_query_does_not_reach_a_director(tmp_path: Path) -> None:
             client.ask("cosim/*/env/*/director", encode(query()), timeout_s=PATIENCE_S)
 
 
-def test_nobody_to_connect_to_is_an_error_with_the_endpoint(tmp_path: Path) -> None:
+def test_nobody_to_connect_to_is_an_error_with_the_endpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A client without a hub fails and names the endpoint."""
+    monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     with pytest.raises(EngineError, match="no hub answers at unixsock-stream"):
         connected_to(endpoint(tmp_path))
 

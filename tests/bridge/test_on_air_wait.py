@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from bridge.live import serve_injections
+from bridge.security import settings
 from bridge.session import Session
 from cosim.spec.injection import Ack
 from tests.bridge.ends import listening_at
@@ -63,8 +64,11 @@ def test_inject_waits_for_the_episode_that_is_named(tmp_path: Path) -> None:
     assert "r/t-1 is on the air" in err
 
 
-def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(tmp_path: Path, cosim: Cosim) -> None:
+def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(
+    tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No run, a run without an episode, another episode: each is told apart, with the remedy."""
+    monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     at = f"unixsock-stream/{tmp_path}/air.sock"
     refused = cosim("listen", "--connect", at)
     assert refused.returncode == 3 and f"no run is on the air at {at}: start one with" in refused.stderr
@@ -73,6 +77,7 @@ def test_without_a_wait_or_after_it_the_refusal_says_what_to_do(tmp_path: Path, 
     assert (
         waited.returncode == 3 and f"no run is on the air at {at}" in waited.stderr and "waited 0.1 s" in waited.stderr
     )
+    monkeypatch.undo()
     with listening_at(at) as hub:
         early = cosim("listen", "--connect", at)
         assert early.returncode == 3 and "none of its episodes" in early.stderr and "--wait 60 waits" in early.stderr

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -255,6 +255,25 @@ def test_a_server_begun_anew_has_lost_the_episode(hub: Connection, monkeypatch: 
                 driver.act(seen_at(5))
             driver.reset("k1", 7)
             assert driver.act(seen_at(0)) == Command(0.1, 0.0)
+
+
+@pytest.mark.engine
+def test_a_server_that_listens_has_lost_its_episode_as_soon_as_another_listens_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long a link may be cut: nobody answers in its place any more."""
+    monkeypatch.setattr(remote, "_LOST_AFTER_S", PATIENCE_S)
+    there = Connection(role="policy", listen=f"unixsock-stream/{tmp_path}/hub")
+    with ExitStack() as stack:
+        with open_session(there) as first, served(first.inside, Counting(), listen=there.listen):
+            run = Connection(role="coordinator", connect=there.listen)
+            driver = remote_driver("zenoh:counting", PolicyHost(servers=(run,), run="run1"))
+            stack.callback(driver.close)
+            driver.reset("k1", 7)
+            driver.act(seen_at(0))
+        stack.enter_context(open_session(there))
+        with pytest.raises(PolicyServerLost, match="is gone"):
+            driver.act(seen_at(5))
 
 
 @contextmanager

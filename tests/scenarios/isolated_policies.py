@@ -106,6 +106,17 @@ def _raises(seen: Observation) -> None:
     raise PolicyServerLost("the server is gone")
 
 
+def _at_the_end(does: Callable[[], object]) -> Callable[[Observation], None]:
+    """Once the episode is over, and its process is told so."""
+
+    def plan(seen: Observation) -> None:
+        from bridge.policy_server import PolicyDesk
+
+        PolicyDesk._end = lambda *_: does()  # type: ignore[method-assign]
+
+    return plan
+
+
 DEEDS: dict[str, Callable[[Observation], object]] = {
     "honest": lambda seen: None,
     "patches-the-referee": _patches,
@@ -119,4 +130,6 @@ DEEDS: dict[str, Callable[[Observation], object]] = {
     "ends": lambda seen: os._exit(0),
     "pretends": _raises,
     "stops-itself": lambda seen: os.kill(os.getpid(), signal.SIGSTOP),
+    "ends-afterwards": _at_the_end(lambda: os._exit(0)),
+    "hangs-afterwards": _at_the_end(lambda: time.sleep(3600)),
 }

@@ -26,7 +26,7 @@ from tests.scenarios.hostile import ACTS, FLOOD_BYTES, RESETS
 
 pytestmark = pytest.mark.engine
 
-ANSWER_S, START_S = 4.0, 5.0
+ANSWER_S, START_S = 3.0, 3.0
 DONE = ""
 """Nothing to say: the episode is done, and simulated as if the policy had done nothing."""
 
@@ -73,9 +73,9 @@ EXPECTED: dict[str, str] = {
     "closes-everything": "the environment process",
     "dies-and-leaves-processes": "the environment process ended with exit code 0 in the policy's act at 0.50 s",
     "kills-its-parent": "the environment process was killed by SIGKILL in the policy's act at 0.50 s, 2 times",
-    "hangs-with-the-lock": "policy 'hostile' gave no answer for 4 s in act at 0.50 s of hangs-with-the-lock",
-    "stops-itself": "gave no answer for 4 s in act at 0.50 s of stops-itself",
-    "hangs-in-reset": "gave no answer for 5 s in reset of hangs-in-reset",
+    "hangs-with-the-lock": "policy 'hostile' gave no answer for 3 s in act at 0.50 s of hangs-with-the-lock",
+    "stops-itself": "gave no answer for 3 s in act at 0.50 s of stops-itself",
+    "hangs-in-reset": "gave no answer for 3 s in reset of hangs-in-reset",
 }
 SEED = "5"
 TWICE = {"dies-and-leaves-processes", "kills-its-parent", "closes-everything"}
@@ -133,7 +133,7 @@ def war(desk: Path, fresh_cosim: Cosim) -> War:
     """One run over all of them, by two processes at a time."""
     mark = f"hostile-{uuid.uuid4()}"
     times = ("--answer-timeout", f"{ANSWER_S:g}", "--start-timeout", f"{START_S:g}")
-    words = ("--policy", "hostile:Hostile", "--jobs", "2", "--seed", SEED, "--out", "war")
+    words = ("--policy", "hostile:Hostile", "--jobs", "2", "--seed", SEED, "--out", "war", "--log-json", "log.jsonl")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("HOSTILE_DESK", str(desk))
         patch.setenv("HOSTILE_MARK", mark)
@@ -173,6 +173,14 @@ def test_a_run_of_hostile_policies_ends_in_order(war: War) -> None:
     table = pd.read_csv(war.folder / "results.csv", index_col="scenario", keep_default_na=False, na_values=[""])
     assert list(table.index) == sorted(EXPECTED)
     assert set(table["success"][table["status"] == "crashed"]) == {0.0}
+
+
+def test_nobody_pays_for_what_another_did_to_the_process(war: War) -> None:
+    """Processes end by what is expected to end them; else they go on, or leave in order with a closed output."""
+    events = [json.loads(line) for line in (war.folder.parent / "log.jsonl").read_text().splitlines()]
+    lost = {one["scenario"]: one["why"] for one in events if one["event"] == "lost"}
+    lost = {name: why for name, why in lost.items() if name not in TWICE}
+    assert set(lost.values()) <= {"the environment process ended with exit code 0"}, lost
 
 
 def test_pictures_are_kept_as_they_were_drawn(desk: Path, cosim: Cosim) -> None:

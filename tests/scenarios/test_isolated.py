@@ -26,13 +26,14 @@ from tests.scenarios.isolated_policies import DEEDS, DESK, FLOOD_BYTES, Honest
 
 OF = "tests.scenarios.isolated_policies"
 SEED = 5
-ANSWER_S = 4.0
+ANSWER_S = 3.0
 CRASHED = {
     "closes-descriptors": "gave no answer: the policy process ended with exit code 1 (act at 0.25 s)",
     "writes-garbage": "gave no answer: the policy process",
     "ends": "policy 'honest' gave no answer: the policy process ended with exit code 0 (act at 0.25 s)",
     "pretends": "policy 'honest' raised PolicyServerLost: the server is gone (act at 0.25 s)",
     "stops-itself": f"policy 'honest' gave no answer for {ANSWER_S:g} s in act at 0.25 s of stops-itself",
+    "hangs-afterwards": f"policy 'honest' gave no answer for {ANSWER_S:g} s in ended of hangs-afterwards",
 }
 """Those that give no answer, by their own fault; all others are done."""
 
@@ -70,7 +71,7 @@ def court(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Court
     write_suite(suite, desk / "deeds.json")
     names = {pseudonym_of(SEED, each).episode: each.id for each in suite.scenarios}
     (desk / "names.json").write_text(json.dumps(names))
-    words = ("--policy", f"{OF}:Cheat", "--isolated", "--seed", str(SEED), "--out", "run")
+    words = ("--policy", f"{OF}:Cheat", "--isolated", "--jobs", "2", "--seed", str(SEED), "--out", "run")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(DESK, str(desk))
         patch.setenv("ISOLATED_MARK", mark)
@@ -81,8 +82,8 @@ def court(tmp_path_factory: pytest.TempPathFactory, fresh_cosim: Cosim) -> Court
 
 @pytest.mark.engine
 def test_isolated_the_street_is_that_of_an_honest_policy(court: Court) -> None:
-    """Patching the referee, asking libsumo, writing into what is given, forking, 64 MB on stdout, another folder: same
-    hash, same verdict, same measures; and the run says that the policy was isolated."""
+    """Patching the referee, asking libsumo, writing into what is given, forking, 64 MB on stdout, another folder, going
+    when all is over: same hash, same verdict, same measures; and the run says that the policy was isolated."""
     honest = court.records["honest"]
     assert honest.status == "done" and honest.policy_runs == "isolated", court.said.stderr
     for name in DEEDS.keys() - CRASHED:
@@ -96,12 +97,12 @@ def test_isolated_the_street_is_that_of_an_honest_policy(court: Court) -> None:
 @pytest.mark.engine
 def test_isolated_who_gives_no_answer_has_crashed_once(court: Court) -> None:
     """Death, garbage, closed descriptors, another's error and SIGSTOP: crashed by its own fault, never invalid, and the
-    environment's process goes on, but for the one that had to be ended because nothing came."""
+    environment's processes, two, go on, but for the two that had to be ended because nothing came."""
     for name, words in CRASHED.items():
         record = court.records[name]
         assert record.status == "crashed" and words in record.reason, f"{name}: {record.status} {record.reason}"
     assert court.said.returncode == 1
-    assert len([*(court.folder / "logs").glob("worker-*.log")]) == 2
+    assert len([*(court.folder / "logs").glob("worker-*.log")]) <= 4
     assert sum(path.stat().st_size for path in (court.folder / "logs").iterdir()) < FLOOD_BYTES // 4
 
 

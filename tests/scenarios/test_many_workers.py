@@ -15,6 +15,7 @@ import pytest
 
 from bridge import keys
 from bridge.codec import encode
+from bridge.security import settings
 from bridge.session import open_session
 from cosim.core.errors import CosimError, EngineError, MachineError
 from cosim.core.versions import versions
@@ -27,6 +28,7 @@ from cosim.spec.scenario import City, CityMap, Scenario, Suite
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.pool import ATTEMPTS, LOSSES, run_all
+from scenarios.execution.transport import HeldRun
 from scenarios.many import roll
 from scenarios.many import workers as remote
 from scenarios.many.nets import Fetched, Nets, lacks
@@ -112,9 +114,8 @@ class Run:
             done = held.finished()
             todo = [one for one in SUITE.scenarios if one.id not in done]
             try:
-                with workers_of_run(
-                    hub, held, todo, SUITE.scenarios, hello, Patience(), lambda _: None, resumed=self._resumed
-                ) as (transport, tell):
+                run = HeldRun(held, hello, Patience(), SUITE.scenarios, todo)
+                with workers_of_run(hub, run, lambda _: None, resumed=self._resumed) as (transport, tell):
                     self.kill = _killer(transport)
                     self.opened.set()
                     run_all(held, todo, hello, transport, tell=tell)
@@ -304,6 +305,24 @@ def test_attempts_are_bounded_and_leaving_is_none(tmp_path: Path, monkeypatch: p
     assert records[unlucky].status == "crashed" and f"was lost, {LOSSES} times" in records[unlucky].reason
 
 
+def test_attempts_outlive_the_coordinator(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scenario that has ended its process once before the coordinator was killed is tried once more, and named."""
+    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
+    run = Run(tmp_path)
+    with hands(run, 1) as (one,):
+        poison = one.job()
+        one.fail()
+        assert one.job() == poison
+        run.kill()
+        assert run.over() == {}
+        run = Run(tmp_path, resumed=True)
+        assert one.job() == poison
+        one.fail()
+        assert one.job() != poison and one.deliver() == Received("kept")
+        records = run.over()
+    assert records[poison].status == "crashed" and "killed by SIGKILL, 2 times" in records[poison].reason
+
+
 def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
     """Garbage, damaged and oversized messages, other runs, scenarios and installations, keys with wildcards: nothing is
     changed by any, and the run goes on."""
@@ -344,9 +363,10 @@ def test_what_is_none_of_the_run_s_is_refused_in_words(tmp_path: Path) -> None:
 def test_a_result_that_cannot_be_written_is_not_acknowledged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A full disk ends the run with its message; begun anew it takes the same result."""
 
-    def full(self: RunFolder, record: Record, log: bytes = b"") -> None:
+    def full(self: RunFolder, record: Record, *data: bytes) -> None:
         raise MachineError("cannot be written: no space left on device")
 
+    monkeypatch.setattr(remote, "SETTLING_S", 0.0)  # nobody else works for it
     run = Run(tmp_path)
     with hands(run, 1) as (one,):
         one.job()
@@ -413,6 +433,7 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
     """By the run folder and by the coordinator's address the same; afterwards what the folder holds; where there is no
     run, in words."""
     monkeypatch.setattr(roll, "SILENT_S", 0.0)
+    monkeypatch.setattr(roll, "_WRITTEN_EVERY_S", 0.0)
     run = Run(tmp_path)
     with hands(run, 3) as (lost, one, silent):
         lost.job()
@@ -432,6 +453,7 @@ def test_status_tells_of_a_lost_a_silent_and_a_working_worker(
         assert lines[one.name][1] == "working" and lines[one.name][4:] == [name, "at", "1", "s,", "50%"]
         assert one.deliver() == Received("kept") and silent.deliver() == Received("kept")
         run.over()
+    monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)
     assert cosim("status", str(run.folder)).stdout == "s, policy stop: 2 of 2 episodes\n"
     assert (said := cosim("status", "--connect", run.endpoint)).returncode == 3 and "no hub answers" in said.stderr
     assert (said := cosim("status")).returncode == 2 and "name a run folder" in said.stderr

@@ -14,7 +14,9 @@ import msgspec
 import psutil
 import pytest
 
+from cosim import run
 from cosim.core.errors import UsageError
+from cosim.policies.baselines import Straight
 from cosim.records.run_folder import read_spec
 from cosim.spec.scenario import Suite, write_suite
 from scenarios.checks import small_scenario
@@ -128,6 +130,10 @@ def test_what_is_no_cluster_is_refused(cosim: Cosim, tmp_path: Path) -> None:
     assert said.returncode == 2 and "--on spark: give ray, auto, or the address of a cluster" in said.stderr
     said = cosim(*words, "--on", "ray", "--shared-renderer", cwd=tmp_path)
     assert said.returncode == 2 and "--shared-renderer is of processes of this machine" in said.stderr
+    with pytest.raises(UsageError, match="shared_renderer is of processes of this machine"):
+        run("reactive", "straight", on="ray", shared_renderer=True, out=tmp_path / "run")
+    with pytest.raises(UsageError, match="on='ray' needs a policy by its name"):
+        run("reactive", Straight(), on="ray")
     assert not [*tmp_path.iterdir()]
 
 

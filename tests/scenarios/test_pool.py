@@ -28,7 +28,7 @@ from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, Los
 from scenarios.execution.shepherd import BoundedLog
 from scenarios.execution.wire import Wire
 from scenarios.rendering.shared import End, SharedRenderer
-from tests.conftest import Cosim, seed_in_order
+from tests.conftest import PATIENCE_S, Cosim, seed_in_order
 
 MODULES = {
     "libsumo": "raise ImportError('libX11.so.6: cannot open shared object file: No such file or directory')",
@@ -62,7 +62,7 @@ class Edits(Mine):
 CANNOT_BEGIN = {
     "Exits": (2, "error: policy 'mine:Exits' cannot be made: SystemExit: no GPU left"),
     "Dies": (2, "error: policy 'mine:Dies' cannot be loaded: the environment process ended with exit code 7"),
-    "Hangs": (2, "error: policy 'mine' gave no answer for 5 s while it was loaded in an environment process"),
+    "Hangs": (2, "error: policy 'mine' gave no answer for 1 s while it was loaded in an environment process"),
     "Changes": (2, "error: policy 'mine:Changes' has another manifest in each process"),
     "Edits": (2, "error: policy 'mine:Edits' was edited while the run was going on: begin another run"),
 }
@@ -76,7 +76,8 @@ def desk(tmp_path: Path) -> Path:
 
 
 def run(cosim: Cosim, desk: Path, name: str, suite: str = "reactive") -> tuple[int, str]:
-    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", "5", "--out", "run")
+    patience_s = "1" if name == "Hangs" else str(PATIENCE_S)
+    words = ("--policy", f"mine:{name}", "--episodes", "3", "--start-timeout", patience_s, "--out", "run")
     said = cosim("run", suite, *words, cwd=desk)
     assert "Traceback" not in said.stderr and not list(desk.glob("run/episodes/*/record.json"))
     assert "crashed" not in said.stdout + said.stderr

@@ -10,14 +10,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
 
-from cosim.core.errors import MachineError
+from cosim.core.errors import MachineError, PolicyServerLost
 from cosim.core.state import Command
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import Observation
@@ -146,6 +146,32 @@ def one_second(name: str) -> Scenario:
 
 
 @pytest.mark.engine
+def test_nobody_waits_for_a_server_that_hangs_to_hear_of_the_end(tmp_path: Path) -> None:
+    """Its policy never answers: that the episode has ended is told, and what comes next is not held up."""
+    shutil.copy(SERVER, tmp_path)
+    shutil.copy(ROOT / "tests" / "bridge" / "served_policies.py", tmp_path)
+    endpoint = free_endpoint()
+
+    def asked() -> None:
+        with suppress(PolicyServerLost):
+            driver.act(seen_at(0, driver))
+
+    with running([*three_packages(tmp_path), "served_policies.py", "Stuck", "stuck", endpoint], tmp_path):
+        driver = found("zenoh:stuck", endpoint, tmp_path / "printed")
+        driver.reset("k1", 1)
+        asking = threading.Thread(target=asked, daemon=True)
+        asking.start()
+        while asking.is_alive() and not (tmp_path / "asked").exists():
+            asking.join(0.02)
+        telling = threading.Thread(target=driver.ended, daemon=True)
+        telling.start()
+        telling.join(PATIENCE_S)
+        assert not telling.is_alive() and asking.is_alive()
+    asking.join(PATIENCE_S)
+    driver.close()
+
+
+@pytest.mark.engine
 def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(tmp_path: Path, cosim: Cosim) -> None:
     """kill -9 in the third question: another server drives it from its start, to the hash of a policy that drives in
     the simulator's process; the second time the episode has crashed. Rows and run.json say `remote`, and the record how
@@ -155,28 +181,17 @@ def test_a_server_that_is_killed_loses_its_episode_which_is_run_again(tmp_path: 
     suite = Suite(name="three", version="1", scenarios=(one_second("a"), one_second("b"), one_second("c")))
     seed, endpoint = seed_in_order(suite.scenarios), free_endpoint()
     write_suite(suite, tmp_path / "three.json")
-    words = (
-        "--policy",
-        "zenoh:dying",
-        "--policy-at",
-        endpoint,
-        "--seed",
-        str(seed),
-        "--out",
-        "run",
-        "--answer-timeout",
-        "8",
-    )
+    words = ("--policy", "zenoh:dying", "--policy-at", endpoint, "--seed", str(seed), "--out", "run")
     with running([*three_packages(tmp_path), "served_policies.py", "Dying", "dying", endpoint], tmp_path):
         found("zenoh:dying", endpoint, tmp_path / "printed").close()
-        said = cosim("run", "three.json", *words, cwd=tmp_path)
+        said = cosim("run", "three.json", *words, "--answer-timeout", "5", cwd=tmp_path)
     a, b, c = sorted(read_records(tmp_path / "run"), key=lambda record: record.scenario)
     here = suite_run.run(
         Suite(name="three", version="1", scenarios=(one_second("a"),)), Honest(), options=EpisodeOptions(seed=seed)
     )
     assert (a.status, [a.state_hash]) == ("done", here["state_hash"].tolist()), a.reason + said.stderr
     assert b.status == "crashed" and "of policy 'dying' is gone, 2 times" in b.reason
-    assert c.status == "crashed" and "policy 'honest' gave no answer for 8 s in act at 0.50 s of c" in c.reason
+    assert c.status == "crashed" and "policy 'honest' gave no answer for 5 s in act at 0.50 s of c" in c.reason
     assert a.policy_runs == b.policy_runs == read_spec(tmp_path / "run").policy_runs == "remote"
     assert a.clock["answer_p95_ms"] >= a.clock["answer_median_ms"] > 0.0 and "policy remote" in said.stdout
     assert said.returncode == 1 and (tmp_path / "thirds").stat().st_size == 5

@@ -64,7 +64,8 @@ def serve_command(
         serve(
             first.policy if first.batches else another,
             name=keys.name(name) if name else keys.chunk(first.manifest.name),
-            listen=connection.endpoint,
+            listen=connection.listen,
+            connect=connection.connect,
             jpeg=jpeg,
             told=first.manifest,
             source=first.source_hash,

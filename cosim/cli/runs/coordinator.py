@@ -14,17 +14,21 @@ import typer
 from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, listening, warned
 from cosim.cli.options.panels import MANY
 from cosim.cli.options.taking import taking
-from cosim.cli.runs.run import ReachesWorkers, carry_out
+from cosim.cli.runs.run import carry_out
 from cosim.cli.terminal.consoles import err
 from cosim.cli.terminal.logs import LogJson, LogLevel, logged
-from cosim.core.errors import INTERRUPTED
+from cosim.core.errors import INTERRUPTED, UsageError
 from cosim.core.journal import happened
 
 coordinator_app = typer.Typer()
 
-_OF_ONE_MACHINE = (
-    "carrier", "jobs", "shared_renderer", "live", "director", "director_wait", "real_time", "shard", "tls", "insecure",
-)  # fmt: skip
+_OF_ONE_MACHINE = {
+    "shared_renderer": "workers draw for themselves",
+    "live": "episodes run elsewhere",
+    "director": "workers ask their own",
+    "real_time": "answers are timed where nothing else runs",
+}
+"""Options of `cosim run` that are refused here, and why."""
 
 
 @coordinator_app.command(
@@ -33,9 +37,10 @@ _OF_ONE_MACHINE = (
     epilog="Examples:  \n`cosim coordinator reactive --policy orca --out runs/mine`, and on the same machine "
     "`cosim worker --jobs 2`  \n"
     "`cosim coordinator reactive --policy orca --out runs/mine --resume`, after it was stopped or killed  \n"
+    "`cosim coordinator reactive --policy orca --seed 7 --shard 1/2 --out runs/1`: see `cosim merge`  \n"
     "`cosim coordinator reactive --policy my_robot.policy:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
 )
-@taking(carry_out, without=_OF_ONE_MACHINE)
+@taking(carry_out, without=("carrier", "jobs", "director_wait", "tls", "insecure"), hidden=_OF_ONE_MACHINE)
 def coordinator_command(
     listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where workers find it.")] = DEFAULT,
     tls: Tls = "",
@@ -50,6 +55,9 @@ def coordinator_command(
     from bridge.session import notices_of, open_session
     from scenarios.many.workers import workers_of_run
 
+    for name, why in _OF_ONE_MACHINE.items():
+        if asked[name]:
+            raise UsageError(f"--{name.replace('_', '-')} is of one machine ({why}): leave it out, or use `cosim run`")
     at = asked["policy_at"] or ()
     files = tls if any(one.startswith("tls/") for one in at) else ""
     ours = tls if listen.startswith("tls/") or not files else ""
@@ -57,7 +65,7 @@ def coordinator_command(
     notices_of(connection)
 
     @contextmanager
-    def carrier() -> Iterator[ReachesWorkers]:
+    def carrier() -> Iterator[Any]:
         with open_session(connection, warned) as session:
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
             yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
@@ -70,7 +78,8 @@ def coordinator_command(
     rich_help_panel=MANY,
     epilog="Examples:  \n`cosim worker --jobs 2`  \n`cosim worker --connect tls/hub.lan:7447 --tls certs/worker --jobs "
     "16 --once`  \nExit codes: 0 told to end by SIGTERM, its episodes handed back, or the run is over (--once); 2 the "
-    "run needs another installation, or its policy cannot be loaded here; 3 this machine lacks something; 130 Ctrl-C",
+    "run needs another installation, or its policy cannot be loaded here; 3 this machine lacks something, or no run "
+    "was heard of for 10 minutes (--once); 130 Ctrl-C",
 )
 def worker_command(
     connect: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where the coordinator listens.")] = DEFAULT,

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from bridge.security import refusal, settings
 from bridge.security.authority import issue, make_authority
 from bridge.security.identity import checked_identity, identity_in
 from bridge.session import open_session
@@ -143,6 +144,7 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
         session.serve("cosim/r/jobs/claim", bytes.upper)
         with open_session(Connection(role="worker", connect=at, tls=str(made / "worker"))) as worker:
             assert worker.ask("cosim/r/jobs/claim", b"mine", timeout_s=60.0) == b"MINE"
+        monkeypatch.setattr(settings, "CONNECTS_WITHIN_S", 0.1)  # what is refused is so however long it is tried
         assert (
             "the certificate of tls/localhost" in (said := tried(at, other / "worker")) and "another authority" in said
         )
@@ -151,8 +153,10 @@ def test_a_hub_that_does_not_fit_is_refused_in_words(
     plain = f"tls/localhost:{free_port()}".replace("tls", "tcp")
     with (
         open_session(Connection(role="coordinator", listen=plain)),
+        monkeypatch.context() as patch,
         pytest.raises(EngineError, match="by the same protocol"),
     ):
+        patch.setattr(refusal, "_PATIENCE_S", 0.2)  # who speaks no TLS never answers
         open_session(Connection(role="worker", connect=plain.replace("tcp", "tls"), tls=str(made / "worker")))
     expired = Connection(role="coordinator", listen=f"tls/localhost:{free_port()}", tls=str(old / "coordinator"))
     with pytest.raises(AccessError, match="has expired on"):
@@ -177,9 +181,9 @@ def test_plain_zenoh_without_a_certificate_of_ours_does_not_come_in(made: Path, 
     at = f"tls/localhost:{free_port()}"
     with open_session(Connection(role="coordinator", listen=at, tls=str(made / "coordinator"))):
         for folder in (other, tmp_path / "none"):
-            with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=1000):
+            with pytest.raises(zenoh.ZError), plain_zenoh(at, folder, "worker", wait_ms=400):
                 pass
-        with pytest.raises(zenoh.ZError), plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=1000):
+        with pytest.raises(zenoh.ZError), plain_zenoh(at.replace("tls", "tcp"), None, "", wait_ms=400):
             pass
         with plain_zenoh(at, made, "worker"):
             pass
