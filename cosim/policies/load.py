@@ -1,4 +1,4 @@
-"""A policy by name: one that ships with the project, or the user's own as `package.module:Class`."""
+"""A policy by name: one that ships with the project, the user's own as `package.module:Class`, or `onnx:FOLDER`."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import math
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 import msgspec
 
@@ -21,9 +22,14 @@ from cosim.episode.driver import Driver, Timer, told_of
 from cosim.episode.given import with_goal
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
+from cosim.policies.shipped import shipped_bundles
 
 _MOST_PX = 4096
 LONGEST_NAME = 100
+FOLLOW = "follow"
+"""The policy of `cosim.policies.follow`, which sees by networks whose weights are not included."""
+ONNX_SCHEME = "onnx:"
+"""Before the folder of an ONNX bundle (`cosim.policies.onnx`)."""
 
 
 def load_policy(name: str, timer: Timer | None = None) -> Driver:
@@ -34,11 +40,18 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
     >>> load_policy("route").manifest.name
     'route'
     """
+    if name.startswith(ONNX_SCHEME):
+        return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser()), timer)
     if ":" not in name:
-        if name not in POLICIES:
-            raise unknown("policy", name, [*POLICIES, "package.module:Class"])
-        policy = POLICIES[name]()
-        return Driver(policy, source_hash=source_hash(policy), timer=timer)
+        if name in POLICIES:
+            policy = POLICIES[name]()
+            return Driver(policy, source_hash=source_hash(policy), timer=timer)
+        bundles = shipped_bundles()
+        if name in bundles:
+            return _by_networks(name, _bundle(bundles[name]), timer)
+        if name == FOLLOW:
+            return _by_networks(name, _follow, timer)
+        raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, "package.module:Class", f"{ONNX_SCHEME}FOLDER"])
     process, home = os.getpid(), Path.cwd()
     if timer is not None:
         timer.starts("loading", 0)
@@ -50,6 +63,46 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
         if os.getpid() != process:
             os._exit(1)  # a child that the user's code has forked
         os.chdir(home)  # the user's code may have gone elsewhere
+        if timer is not None:
+            timer.stops()
+
+
+class _Networked(Policy, Protocol):
+    """A policy that loads networks; digest: of them, and of whatever else decides its answers."""
+
+    digest: str
+
+
+def _bundle(folder: Path) -> Callable[[], _Networked]:
+    """What makes the policy of an ONNX bundle."""
+
+    def make() -> _Networked:
+        from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import
+
+        return onnx_policy(folder)
+
+    return make
+
+
+def _follow() -> _Networked:
+    from cosim.policies.follow.policy import Follow
+
+    return Follow()
+
+
+def _by_networks(name: str, make: Callable[[], _Networked], timer: Timer | None) -> Driver:
+    """The policy that `make` makes. Raises UsageError for whatever is wrong with its networks."""
+    if timer is not None:
+        timer.starts("loading", 0)
+    try:
+        policy = make()
+        manifest = checked_manifest(name, msgspec.to_builtins(policy.manifest))
+        digest = hashlib.blake2b(f"{source_hash(policy)}{policy.digest}".encode(), digest_size=8)
+        return Driver(policy, manifest, digest.hexdigest(), timer)
+    except (UsageError, SpecError) as error:
+        said = str(error).removeprefix(f"policy '{name}': ")
+        raise UsageError(f"policy '{name}': {said}") from error
+    finally:
         if timer is not None:
             timer.stops()
 

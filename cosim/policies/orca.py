@@ -141,7 +141,9 @@ class Orca:
         dt_s = max(observation.time_s - self._last_time_s, 1e-3)
         self._last_time_s = observation.time_s
         robot = observation.robot
-        limit_mps = min(crossing_limit(known, robot), unhurried(known, robot), stop_limit(known), speeds_of(robot)[0])
+        crossing_mps = crossing_limit(known, robot)
+        rolls_up_mps = unhurried(known, robot, crossing_mps)
+        limit_mps = min(crossing_mps, rolls_up_mps, stop_limit(known), speeds_of(robot)[0])
         if self._yielding.waits(known, observation.time_s):
             limit_mps = 0.0
         x_m, y_m, _ = known.robot.pose
@@ -227,15 +229,15 @@ def nearby(known: Privileged) -> People:
     return people.only(np.flatnonzero(near))
 
 
-def unhurried(known: Privileged, robot: Robot) -> float:
+def unhurried(known: Privileged, robot: Robot, crossing_mps: float) -> float:
     """Speed in m/s at which the robot comes up to a crossing not long before its signal turns red, if it is near and
-    the green that is left is too short."""
+    the green that is left is too short. crossing_mps: its `crossing_limit`."""
     for crossing_id, enter_s_m, _ in known.crossings:
         room_m = enter_s_m - known.route_s_m - (robot.length_m / 2 + STOP_SHORT_M)
         signal = known.signals.get(crossing_id)
         if not 0.0 < room_m < 8.0 or signal is None or not signal.walk or signal.changes_in_s is None:
             continue
-        if math.isfinite(crossing_limit(known, robot)) and signal.changes_in_s > _STANDS_AT_WALK_S:
+        if math.isfinite(crossing_mps) and signal.changes_in_s > _STANDS_AT_WALK_S:
             return room_m / (signal.changes_in_s - _STANDS_AT_WALK_S)
     return math.inf
 

@@ -1,0 +1,273 @@
+"""From observations to a graph's inputs: what is remembered of an episode, and the tensors of its next question."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import deque
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.core.errors import UsageError
+from cosim.core.geometry import wrap_angle
+from cosim.episode.ports import Observation
+from cosim.policies.onnx.graph import Tensor, TensorPort
+from cosim.policies.onnx.inputs import (
+    AnyInput,
+    ConstantInput,
+    GoalPictureInput,
+    GoalPointInput,
+    JoinedInput,
+    MaskInput,
+    NoiseInput,
+    PastInput,
+    PastPositionsInput,
+    PictureInput,
+    PixelsInput,
+    RoutePatchInput,
+    SpeedsInput,
+    StateInput,
+    TurnInput,
+    VectorInput,
+)
+from cosim.policies.onnx.pictures import axes_turned, laid_out, picture_numbers, shape_of
+from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
+
+_TURNS: Final = re.compile(r"(?:In (\d+) m, )?(?:turn|bear) (left|right)", re.IGNORECASE)
+_PATCH_PX: Final = 80
+_GOAL_IS_GIVEN: Final = "a run gives the goals that the manifest asks for"
+
+
+class Feeder:
+    """What is remembered of one episode. `feed` is asked once for every answer of the policy.
+
+    inputs: by the names of `ports`, the graph's. Raises UsageError where a tensor cannot have the shape or type that
+    the graph wants.
+    """
+
+    def __init__(self, inputs: Mapping[str, AnyInput], ports: Mapping[str, TensorPort], seed: int) -> None:
+        self._inputs, self._ports = inputs, ports
+        self._draws = np.random.default_rng(seed)
+        self._past: dict[int, deque[Any]] = {}
+        self._state: dict[str, Tensor] = {}
+        for name, one in inputs.items():
+            if isinstance(one, PixelsInput | RoutePatchInput):
+                _check_pixels(name, one, ports[name])
+        self.forget()
+
+    def forget(self) -> None:
+        """The robot was put elsewhere: what was seen before is no history."""
+        self._past.clear()
+        for name, one in self._inputs.items():
+            if isinstance(one, StateInput):
+                self._state[name] = np.full(_whole(name, self._ports[name]), one.begin, self._ports[name].dtype)
+
+    def feed(self, seen: Observation) -> dict[str, Tensor]:
+        """The tensors of one question, their first axis of length 1 where the graph has any."""
+        return {name: self._tensor(name, one, seen) for name, one in self._inputs.items()}
+
+    def remember(self, answer: Mapping[str, Tensor]) -> None:
+        """Keep of an answer what is the graph's state."""
+        for name, one in self._inputs.items():
+            if isinstance(one, StateInput):
+                held, told = self._state[name], answer[one.output].astype(self._ports[name].dtype)
+                if one.append:
+                    told = np.concatenate([held, told.reshape(held.shape[0], 1, *held.shape[2:])], axis=1)
+                    told = told[:, told.shape[1] - held.shape[1] :]
+                self._state[name] = told.reshape(held.shape)
+
+    def _tensor(self, name: str, one: AnyInput, seen: Observation) -> Tensor:
+        port = self._ports[name]
+        if isinstance(one, StateInput):
+            return self._state[name]
+        if isinstance(one, NoiseInput):
+            return self._draws.standard_normal(_whole(name, port)).astype(port.dtype)
+        if isinstance(one, MaskInput):
+            given = any(_takes(other, seen.goal) for other in self._inputs.values())
+            return np.full(_whole(name, port), one.given if given else one.missing, port.dtype)
+        if isinstance(one, ConstantInput) and not isinstance(one.value, tuple):
+            return np.full(_whole(name, port), one.value, port.dtype)
+        if isinstance(one, PixelsInput | RoutePatchInput):
+            return laid_out(self._frames(one, seen), one.layout).astype(port.dtype, copy=False)
+        return _shaped(name, self._numbers(one, seen), port)
+
+    def _frames(self, one: PixelsInput | RoutePatchInput, seen: Observation) -> list[NDArray[Any]]:
+        """The last ones, each as `axes_turned` gives it."""
+        now = _frame(one, seen)
+        if now is None:
+            assert isinstance(one, GoalPictureInput | RoutePatchInput) and one.missing is not None, _GOAL_IS_GIVEN
+            now = np.full(_sides(one), one.missing, np.float32)
+        now = axes_turned(now, one.layout)
+        return [np.zeros_like(now) if frame is None else frame for frame in self._past_of(one, now)]
+
+    def _numbers(self, one: AnyInput, seen: Observation) -> NDArray[np.float64]:
+        """Those of a vector, (frames, values) or fewer axes."""
+        if isinstance(one, JoinedInput):
+            return np.concatenate([self._numbers(part, seen).ravel() for part in one.parts])
+        if isinstance(one, ConstantInput):
+            return np.atleast_1d(np.asarray(one.value, float))
+        if isinstance(one, TurnInput):
+            return np.asarray(_turn_told(one, seen.goal), float)
+        assert isinstance(one, VectorInput)
+        if isinstance(one, PastPositionsInput):
+            rows: list[NDArray[np.float64] | None] = _seen_from_now(self._past_of(one, _place(seen)), one)
+        else:
+            now = _goal_values(one, seen.goal) if isinstance(one, GoalPointInput) else _speeds(one, seen)
+            rows = self._past_of(one, now)
+        numbers = [None if row is None else (row - (one.mean or 0.0)) / (one.std or 1.0) for row in rows]
+        return np.array([np.zeros(len(one.values)) if row is None else row for row in numbers])
+
+    def _past_of(self, one: PastInput, now: Any) -> list[Any]:
+        """What is kept of an input, now the newest; None for zeros."""
+        kept = self._past.get(id(one))
+        if kept is None:
+            kept = self._past[id(one)] = deque(maxlen=(one.frames - 1) * one.every + 1)
+            if one.before == "repeat":
+                kept.extend([now] * ((one.frames - 1) * one.every))
+            else:
+                kept.extend([None] * ((one.frames - 1) * one.every))
+        kept.append(now)
+        chosen = list(kept)[:: one.every]
+        return chosen if one.order == "oldest_first" else chosen[::-1]
+
+
+def _frame(one: PixelsInput | RoutePatchInput, seen: Observation) -> NDArray[Any] | None:
+    """(rows, columns, channels) of now; None where the goal is another."""
+    goal = seen.goal
+    if isinstance(one, RoutePatchInput):
+        if not isinstance(goal, RoutePatch):
+            return None
+        return np.where(goal.pixels[..., None] > 0, np.float32(one.on), np.float32(one.off))
+    if isinstance(one, PictureInput):
+        rgb = seen.pictures[one.camera].rgb if one.camera else seen.rgb
+        assert rgb is not None, "the manifest asks for a camera"
+        return picture_numbers(rgb, one)
+    return picture_numbers(goal.rgb, one) if isinstance(goal, ImageGoal) else None
+
+
+def _takes(one: AnyInput, goal: Goal | None) -> bool:
+    """Whether an input is made of such a goal."""
+    if isinstance(one, GoalPictureInput):
+        return isinstance(goal, ImageGoal)
+    if isinstance(one, RoutePatchInput):
+        return isinstance(goal, RoutePatch)
+    if isinstance(one, TurnInput):
+        return isinstance(goal, Instruction | PointGoal)
+    if isinstance(one, JoinedInput):
+        return any(_takes(part, goal) for part in one.parts)
+    return isinstance(one, GoalPointInput) and isinstance(goal, PointGoal)
+
+
+def _goal_values(one: GoalPointInput, goal: Goal | None) -> NDArray[np.float64]:
+    """Those of a point, in its units; what stands for it where there is none, as it would be after normalisation."""
+    if not isinstance(goal, PointGoal):
+        assert one.missing is not None, _GOAL_IS_GIVEN
+        return np.asarray(one.missing, float) * (one.std or 1.0) + (one.mean or 0.0)
+    far_m = goal.distance_m
+    scale = 1.0 if one.most_m is None or far_m <= one.most_m else one.most_m / far_m
+    bearing = goal.bearing_rad
+    known = {
+        "x": goal.x_m * scale / one.unit_m,
+        "y": goal.y_m * scale / one.unit_m,
+        "distance": far_m * scale / one.unit_m,
+        "cos": math.cos(bearing),
+        "sin": math.sin(bearing),
+        "bearing": bearing,
+    }
+    return _chosen(one.values, known)
+
+
+def _speeds(one: VectorInput, seen: Observation) -> NDArray[np.float64]:
+    assert isinstance(one, SpeedsInput)
+    return _chosen(one.values, {"v": seen.v_mps, "w": seen.w_radps})
+
+
+def _chosen(names: tuple[str, ...], known: Mapping[str, float]) -> NDArray[np.float64]:
+    """Values by their names; "-" before one turns its sign."""
+    return np.array([-known[name[1:]] if name.startswith("-") else known[name] for name in names])
+
+
+def _place(seen: Observation) -> tuple[float, float, float]:
+    """Where the robot takes itself to be: x, y in metres, heading in radians."""
+    odometry = seen.odometry
+    assert odometry is not None and odometry.heading_rad is not None, "the manifest asks for odometry with a heading"
+    return odometry.x_m, odometry.y_m, odometry.heading_rad
+
+
+def _seen_from_now(past: list[Any], one: PastPositionsInput) -> list[NDArray[np.float64] | None]:
+    """Places in the frame of the newest of them, a row each; None where there was none."""
+    x0, y0, heading0 = past[-1] if one.order == "oldest_first" else past[0]
+    cos, sin = math.cos(heading0), math.sin(heading0)
+    rows: list[NDArray[np.float64] | None] = []
+    for place in past:
+        if place is None:
+            rows.append(None)
+            continue
+        dx, dy, turned = place[0] - x0, place[1] - y0, wrap_angle(place[2] - heading0)
+        known = {
+            "x": (cos * dx + sin * dy) / one.unit_m,
+            "y": (-sin * dx + cos * dy) / one.unit_m,
+            "heading": turned,
+            "cos": math.cos(turned),
+            "sin": math.sin(turned),
+        }
+        rows.append(_chosen(one.values, known))
+    return rows
+
+
+def _turn_told(one: TurnInput, goal: Goal | None) -> tuple[float, ...]:
+    """The numbers of the way to go."""
+    if isinstance(goal, PointGoal):
+        beyond_rad = math.radians(one.beyond_deg)
+        if abs(goal.bearing_rad) <= beyond_rad:
+            return one.straight
+        return one.left if goal.bearing_rad > 0.0 else one.right
+    if isinstance(goal, Instruction):
+        told = _TURNS.search(goal.text)
+        if told is None or (told[1] is not None and float(told[1]) > one.ahead_m):
+            return one.straight
+        return one.left if told[2].lower() == "left" else one.right
+    assert one.missing is not None, _GOAL_IS_GIVEN
+    return one.missing
+
+
+def _whole(name: str, port: TensorPort) -> tuple[int, ...]:
+    """The shape of an input whose first axis alone may be of any length, which is 1 then."""
+    if None in port.shape[1:]:
+        raise UsageError(f"inputs.{name}: the graph wants {port.in_words}: export it with fixed sides but the first")
+    return tuple(1 if side is None else side for side in port.shape)
+
+
+def _shaped(name: str, numbers: NDArray[np.float64], port: TensorPort) -> Tensor:
+    """Numbers in the shape of an input, of which one axis beside the first may be of any length."""
+    shape = [1 if side is None and axis == 0 else side for axis, side in enumerate(port.shape)]
+    free = shape.count(None)
+    held = math.prod(side for side in shape if side is not None)
+    if free > 1 or (numbers.size != held if not free else numbers.size % held):
+        made = " x ".join(map(str, numbers.shape))
+        raise UsageError(f"inputs.{name}: the graph wants {port.in_words}, and the manifest gives {made} numbers")
+    return numbers.reshape([-1 if side is None else side for side in shape]).astype(port.dtype)
+
+
+def _check_pixels(name: str, one: PixelsInput | RoutePatchInput, port: TensorPort) -> None:
+    """Raises UsageError unless a tensor of pixels has the shape and the type of an input."""
+    shape = shape_of(_sides(one), one.frames, one.layout)
+    if len(port.shape) != len(shape) or any(
+        side not in (None, there) for side, there in zip(port.shape, shape, strict=True)
+    ):
+        raise UsageError(
+            f"inputs.{name}: the graph wants {port.in_words}, and layout {one.layout!r} gives {shape}: "
+            "look at frames, size, colour and layout"
+        )
+    if port.dtype.kind in "iu" and isinstance(one, PixelsInput) and not one.as_they_are:
+        raise UsageError(
+            f"inputs.{name}: the graph wants {port.in_words}, whole numbers: say scale 1, without mean and std"
+        )
+
+
+def _sides(one: PixelsInput | RoutePatchInput) -> tuple[int, int, int]:
+    """Rows, columns and channels of a frame."""
+    return (_PATCH_PX, _PATCH_PX, 1) if isinstance(one, RoutePatchInput) else (*one.sides, one.channels)

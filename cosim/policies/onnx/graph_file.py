@@ -1,0 +1,129 @@
+"""What an ONNX file says without a runtime: its weights and the files that hold more of them.
+
+An ONNX file is a protobuf message; this reads the few fields of it that are named here, by their numbers in onnx.proto.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+_GRAPH_OF_MODEL: Final = 7
+_NODE_OF_GRAPH: Final = 1
+_INITIALIZER_OF_GRAPH: Final = 5
+_ATTRIBUTE_OF_NODE: Final = 5
+_TENSOR_OF_ATTRIBUTE: Final = 5
+_GRAPH_OF_ATTRIBUTE: Final = 6
+_TYPE, _FLOATS, _NAME, _RAW, _DOUBLES, _EXTERNAL = 2, 4, 8, 9, 10, 13
+"""Fields of a tensor."""
+_KEY, _VALUE = 1, 2
+_FLOAT, _FLOAT16, _DOUBLE, _BFLOAT16 = 1, 10, 11, 16
+"""Types of a tensor's numbers."""
+_DTYPES: Final = {_FLOAT: "<f4", _FLOAT16: "<f2", _DOUBLE: "<f8", _BFLOAT16: "<u2"}
+
+_Field = tuple[int, int | memoryview]
+
+
+def external_files(data: bytes) -> list[str]:
+    """The names of the files beside the graph that hold weights of it. Raises ValueError for what is no ONNX file."""
+    found = set[str]()
+    for tensor in _tensors(memoryview(data)):
+        for number, entry in _fields(tensor):
+            if number == _EXTERNAL and isinstance(entry, memoryview):
+                texts = {key: bytes(text).decode() for key, text in _fields(entry) if isinstance(text, memoryview)}
+                if texts.get(_KEY) == "location":
+                    found.add(texts.get(_VALUE, ""))
+    return sorted(found)
+
+
+def weights_not_finite(data: bytes) -> list[str]:
+    """The names of the weights in the file that hold NaN or infinities. Raises ValueError for what is no ONNX file.
+
+    Minus infinity is let through: masks of attention are made of it.
+    """
+    return [_name(tensor) for tensor in _tensors(memoryview(data)) if not _is_finite(tensor)]
+
+
+def _is_finite(tensor: memoryview) -> bool:
+    fields = dict(_fields(tensor))
+    kind, raw = fields.get(_TYPE), fields.get(_RAW)
+    if kind not in _DTYPES:
+        return True
+    raw = fields.get({_FLOAT: _FLOATS, _DOUBLE: _DOUBLES}.get(kind, _RAW), raw)
+    if not isinstance(raw, memoryview) or len(raw) % np.dtype(_DTYPES[kind]).itemsize:
+        return True
+    numbers: NDArray[Any] = np.frombuffer(raw, _DTYPES[kind])
+    if kind == _BFLOAT16:
+        numbers = (numbers.astype(np.uint32) << 16).view(np.float32)
+    return not bool(np.isnan(numbers).any() or np.isposinf(numbers).any())
+
+
+def _name(tensor: memoryview) -> str:
+    name = dict(_fields(tensor)).get(_NAME, b"")
+    return bytes(name).decode(errors="replace") if isinstance(name, memoryview) else ""
+
+
+def _tensors(model: memoryview) -> Iterator[memoryview]:
+    """The weights of a model, those of constants and of graphs within it included."""
+    graphs = [graph for number, graph in _fields(model) if number == _GRAPH_OF_MODEL]
+    if not graphs:
+        raise ValueError("has no graph")
+    while graphs:
+        graph = graphs.pop()
+        if not isinstance(graph, memoryview):
+            raise ValueError("has no graph")
+        for number, part in _fields(graph):
+            if not isinstance(part, memoryview):
+                continue
+            if number == _INITIALIZER_OF_GRAPH:
+                yield part
+            elif number == _NODE_OF_GRAPH:
+                for _, attribute in filter(_is_attribute, _fields(part)):
+                    assert isinstance(attribute, memoryview)
+                    for kind, held in _fields(attribute):
+                        if kind == _TENSOR_OF_ATTRIBUTE and isinstance(held, memoryview):
+                            yield held
+                        elif kind == _GRAPH_OF_ATTRIBUTE:
+                            graphs.append(held)
+
+
+def _is_attribute(field: _Field) -> bool:
+    return field[0] == _ATTRIBUTE_OF_NODE and isinstance(field[1], memoryview)
+
+
+def _fields(message: memoryview) -> Iterator[_Field]:
+    """Number and value of each field of a protobuf message. Raises ValueError for what is none."""
+    at = 0
+    while at < len(message):
+        key, at = _varint(message, at)
+        number, wire = key >> 3, key & 7
+        if wire == 0:
+            value, at = _varint(message, at)
+            yield number, value
+            continue
+        if wire == 2:
+            length, at = _varint(message, at)
+        elif wire in (1, 5):
+            length = 8 if wire == 1 else 4
+        else:
+            raise ValueError(f"is no protobuf message: wire type {wire}")
+        if not number or at + length > len(message):
+            raise ValueError("is no protobuf message, or ends too early")
+        yield number, message[at : at + length]
+        at += length
+
+
+def _varint(message: memoryview, at: int) -> tuple[int, int]:
+    """A number of variable length, and where it ends."""
+    value = 0
+    for shift in range(0, 70, 7):
+        if at >= len(message):
+            raise ValueError("is no protobuf message, or ends too early")
+        value |= (message[at] & 0x7F) << shift
+        at += 1
+        if message[at - 1] < 0x80:
+            return value, at
+    raise ValueError("is no protobuf message")

@@ -1,0 +1,302 @@
+"""What goes into a graph, input by input: the field `inputs` of a bundle's manifest.
+
+{"what": "picture", "frames": 6, "size": [85, 64], "layout": "N(TC)HW", "mean": [0.485, 0.456, 0.406], "std": [0.229,
+ 0.224, 0.225]}
+{"what": "goal_point", "values": ["distance", "cos", "sin"], "unit_m": 200, "most_m": 200}
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Final, Literal, get_args
+
+from cosim.spec.goal import GoalProtocol
+from cosim.spec.ranges import Counted, Ranged, Within
+
+_NUMBER: Final = Within(-1e9, 1e9)
+_SIDE: Final = Within(1, 4096)
+_AXES: Final = {"N", "T", "C", "H", "W"}
+POINTS: Final[tuple[GoalProtocol, ...]] = ("route_point", "final_point", "random_point")
+_PICTURES: Final[tuple[GoalProtocol, ...]] = ("image", "random_image")
+
+
+class AnyInput(Ranged, frozen=True, kw_only=True):
+    @property
+    def called(self) -> str:
+        return f"{self.__struct_config__.tag} "
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        """The goals that it can be made of; () where it is made of none, or can do without."""
+        return ()
+
+
+class PastInput(AnyInput, frozen=True, kw_only=True):
+    """The last `frames` of something, `every` so many answers of the policy, the newest of now. before: what stands for
+    those from before the episode's beginning, or before the robot was put elsewhere: the first since, or zeros."""
+
+    frames: Annotated[int, Within(1, 256)] = 1
+    every: Annotated[int, Within(1, 256)] = 1
+    order: Literal["oldest_first", "newest_first"] = "oldest_first"
+    before: Literal["repeat", "zeros"] = "repeat"
+
+
+class VectorInput(PastInput, frozen=True, kw_only=True):
+    """Numbers: (frames, values), in the shape that the graph has. mean, std: one of each value, which becomes
+    (value - mean) / std; empty for 0 and 1."""
+
+    values: tuple[str, ...] = ()
+    mean: Annotated[tuple[float, ...], Counted(0, 16)] = ()
+    std: Annotated[tuple[float, ...], Counted(0, 16)] = ()
+
+    def contradictions(self) -> Iterator[str]:
+        yield from _normalised(self.called, self.mean, self.std, len(self.values))
+
+
+class PixelsInput(PastInput, frozen=True, kw_only=True):
+    """Pictures. crop: of the picture, as shares (x0, y0, x1, y1) of its sides; then fit brings it to size (width,
+    height): stretched, cut to the shape of size around its middle, or whole, in the middle (letterbox) or in the upper
+    left corner, with a border of grey `border` (0 to 255).
+    resample: how; colour: the channels' order; yuv420: six channels of half the size (four of Y, U, V), as openpilot
+    has them. Numbers become (pixel / scale - mean) / std; scale 1 leaves 0 to 255, which a graph of uint8 needs.
+
+    layout: the graph's axes, outermost first: N of 1, T frames, C channels, H rows, W columns; those in brackets are
+    one axis, such as "N(TC)HW", frames stacked into channels. N, and T and C where there is one of them, may be absent.
+    """
+
+    size: tuple[Annotated[int, _SIDE], Annotated[int, _SIDE]]
+    fit: Literal["stretch", "crop", "letterbox", "corner"] = "stretch"
+    crop: tuple[float, float, float, float] | None = None
+    border: Annotated[int, Within(0, 255)] = 114
+    resample: Literal["area", "linear", "cubic", "nearest"] = "area"
+    colour: Literal["rgb", "bgr", "grey", "yuv420"] = "rgb"
+    scale: Annotated[float, Within(0, 1e6, above=True)] = 255.0
+    mean: Annotated[tuple[float, ...], Counted(0, 6)] = ()
+    std: Annotated[tuple[float, ...], Counted(0, 6)] = ()
+    layout: str = "NCHW"
+
+    @property
+    def channels(self) -> int:
+        """How many there are of a frame."""
+        return {"grey": 1, "yuv420": 6}.get(self.colour, 3)
+
+    @property
+    def as_they_are(self) -> bool:
+        """Whether pixels stay bytes."""
+        return self.scale == 1.0 and not self.mean and not self.std
+
+    @property
+    def sides(self) -> tuple[int, int]:
+        """Rows and columns of the tensor."""
+        width, height = self.size
+        return (height // 2, width // 2) if self.colour == "yuv420" else (height, width)
+
+    def contradictions(self) -> Iterator[str]:
+        yield from _normalised(self.called, self.mean, self.std, self.channels)
+        yield layout_refusal(self.called, self.layout, T=self.frames, C=self.channels)
+        if not all(_SIDE.low <= side <= _SIDE.high for side in self.size):
+            yield f"{self.called}size must be two sides of {_SIDE} pixels, not {list(self.size)}"
+        elif self.colour == "yuv420" and (self.size[0] % 2 or self.size[1] % 2):
+            yield f"{self.called}size must be even for yuv420, not {list(self.size)}"
+        if self.crop is not None and not (
+            0.0 <= self.crop[0] < self.crop[2] <= 1.0 and 0.0 <= self.crop[1] < self.crop[3] <= 1.0
+        ):
+            yield f"{self.called}crop must be shares [x0, y0, x1, y1] with 0 <= x0 < x1 <= 1, not {list(self.crop)}"
+
+
+class PictureInput(PixelsInput, frozen=True, kw_only=True, tag="picture", tag_field="what"):
+    """What the camera sees. camera: of which one, a name of `cameras`; "" for the camera.
+
+    >>> PictureInput(size=(85, 64), frames=6, layout="N(TC)HW").channels
+    3
+    """
+
+    camera: str = ""
+
+
+class GoalPictureInput(PixelsInput, frozen=True, kw_only=True, tag="goal_picture", tag_field="what"):
+    """The picture of where to go. missing: fills the tensor where a run's goals are no pictures; None: refused."""
+
+    missing: Annotated[float | None, _NUMBER] = None
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        return _PICTURES if self.missing is None else ()
+
+
+class GoalPointInput(VectorInput, frozen=True, kw_only=True, tag="goal_point", tag_field="what"):
+    """The point of where to go, in the robot's frame of its frame. x, y, distance in units of `unit_m`; a distance of
+    more than `most_m` becomes that, x and y in proportion; bearing in radians, counter-clockwise from ahead.
+    missing: the values where a run's goals are no points, as the graph gets them; None: refused."""
+
+    values: Annotated[
+        tuple[Literal["x", "-x", "y", "-y", "distance", "cos", "sin", "-sin", "bearing", "-bearing"], ...],
+        Counted(1, 8),
+    ] = ("x", "y")
+    unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
+    most_m: Annotated[float | None, Within(0, 1e6, above=True)] = None
+    missing: tuple[float, ...] | None = None
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        return POINTS if self.missing is None else ()
+
+    def contradictions(self) -> Iterator[str]:
+        yield from super().contradictions()
+        if self.missing is not None and len(self.missing) != len(self.values):
+            yield f"goal_point missing must hold {len(self.values)} numbers, one of each value, not {len(self.missing)}"
+
+
+class RoutePatchInput(PastInput, frozen=True, kw_only=True, tag="route_patch", tag_field="what"):
+    """The raster of the route around the robot (`cosim.spec.goal.RoutePatch`), with the numbers `on` the route and
+    `off` it. missing: fills the tensor where a run's goals are no route patches; None: refused."""
+
+    on: Annotated[float, _NUMBER] = 1.0
+    off: Annotated[float, _NUMBER] = 0.0
+    layout: str = "NCHW"
+    missing: Annotated[float | None, _NUMBER] = None
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        return ("route_patch",) if self.missing is None else ()
+
+    def contradictions(self) -> Iterator[str]:
+        yield layout_refusal(self.called, self.layout, T=self.frames, C=1)
+
+
+class TurnInput(AnyInput, frozen=True, kw_only=True, tag="command", tag_field="what"):
+    """Which way to go: the numbers of left, straight or right. Of an instruction, what is due, or told within
+    `ahead_m`; of a point, where it lies more than `beyond_deg` aside. missing: with other goals; None: refused."""
+
+    left: Annotated[tuple[float, ...], Counted(1, 16)] = (-1.0,)
+    straight: Annotated[tuple[float, ...], Counted(1, 16)] = (0.0,)
+    right: Annotated[tuple[float, ...], Counted(1, 16)] = (1.0,)
+    ahead_m: Annotated[float, Within(0, 20)] = 5.0
+    beyond_deg: Annotated[float, Within(0, 180)] = 30.0
+    missing: Annotated[tuple[float, ...] | None, Counted(1, 16)] = None
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        return ("instruction", *POINTS) if self.missing is None else ()
+
+    def contradictions(self) -> Iterator[str]:
+        counts = {len(one) for one in (self.left, self.straight, self.right, self.missing) if one is not None}
+        if len(counts) > 1:
+            yield "command left, straight, right and missing must hold as many numbers each"
+
+
+class SpeedsInput(VectorInput, frozen=True, kw_only=True, tag="speeds", tag_field="what"):
+    """The robot's own speeds, m/s and rad/s."""
+
+    values: Annotated[tuple[Literal["v", "w", "-w"], ...], Counted(1, 8)] = ("v", "w")
+
+
+class PastPositionsInput(VectorInput, frozen=True, kw_only=True, tag="past_positions", tag_field="what"):
+    """Where the robot was, by its odometry, in its frame of now; the last one is now, at the origin. heading: in
+    radians, counter-clockwise from that of now."""
+
+    values: Annotated[
+        tuple[Literal["x", "-x", "y", "-y", "cos", "sin", "-sin", "heading", "-heading"], ...], Counted(1, 8)
+    ] = ("x", "y")
+    unit_m: Annotated[float, Within(0, 1e6, above=True)] = 1.0
+
+
+class MaskInput(AnyInput, frozen=True, kw_only=True, tag="mask", tag_field="what"):
+    """A number that tells whether there is a goal that another input takes."""
+
+    given: Annotated[float, _NUMBER] = 0.0
+    missing: Annotated[float, _NUMBER] = 1.0
+
+
+class ConstantInput(AnyInput, frozen=True, kw_only=True, tag="constant", tag_field="what"):
+    """Always the same: one number for the whole tensor, or all of them, the last axis first."""
+
+    value: float | tuple[float, ...]
+
+
+class NoiseInput(AnyInput, frozen=True, kw_only=True, tag="noise", tag_field="what"):
+    """Normal noise, drawn anew for every answer from the episode's seed."""
+
+
+class StateInput(AnyInput, frozen=True, kw_only=True, tag="state", tag_field="what"):
+    """What the graph remembers: the output `output` of the answer before, or with `append` a row of it behind the older
+    rows, of which the first goes. `begin` fills it when an episode begins, or the robot was put elsewhere."""
+
+    output: str
+    append: bool = False
+    begin: Annotated[float, _NUMBER] = 0.0
+
+
+_Part = GoalPointInput | SpeedsInput | PastPositionsInput | TurnInput | ConstantInput
+
+
+class JoinedInput(AnyInput, frozen=True, kw_only=True, tag="joined", tag_field="what"):
+    """Vectors one behind the other: all numbers of the first, then all of the second."""
+
+    parts: Annotated[tuple[_Part, ...], Counted(1, 8)]
+
+    @property
+    def needs(self) -> tuple[GoalProtocol, ...]:
+        wanted = [set(part.needs) for part in self.parts if part.needs]
+        return tuple(one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted))
+
+    def contradictions(self) -> Iterator[str]:
+        if any(part.needs for part in self.parts) and not self.needs:
+            yield "joined parts need goals that no run can give at once"
+
+
+GraphInput = (
+    PictureInput
+    | GoalPictureInput
+    | GoalPointInput
+    | RoutePatchInput
+    | TurnInput
+    | SpeedsInput
+    | PastPositionsInput
+    | MaskInput
+    | ConstantInput
+    | NoiseInput
+    | StateInput
+    | JoinedInput
+)
+
+
+def axes_of(layout: str) -> list[str]:
+    """The axes of a layout, outermost first: those in brackets are one.
+
+    >>> axes_of("N(TC)HW")
+    ['N', 'TC', 'H', 'W']
+    """
+    groups: list[str] = []
+    inside = False
+    for letter in layout:
+        if letter in "()":
+            inside = letter == "("
+            groups.append("")
+        elif inside:
+            groups[-1] += letter
+        else:
+            groups.append(letter)
+    return [group for group in groups if group]
+
+
+def layout_refusal(called: str, layout: str, **counts: int) -> str:
+    """What is wrong with a layout of so many frames T and channels C; "" if nothing is."""
+    groups = axes_of(layout)
+    letters = "".join(groups)
+    brackets = layout.replace("(", "").replace(")", "") == letters and layout.count("(") == layout.count(")")
+    if not brackets or len(set(letters)) != len(letters) or not {"H", "W"} <= set(letters) <= _AXES:
+        return (
+            f"{called}layout must be of the letters N T C H W, once each, with H and W, such as N(TC)HW: not {layout!r}"
+        )
+    absent = [f"{letter} of {count}" for letter, count in counts.items() if count > 1 and letter not in letters]
+    return f"{called}layout {layout!r} has no axis for {', '.join(absent)}" if absent else ""
+
+
+def _normalised(called: str, mean: Sequence[float], std: Sequence[float], count: int) -> Iterator[str]:
+    """What is wrong with the mean and standard deviation of `count` values."""
+    for field, numbers in (("mean", mean), ("std", std)):
+        if numbers and len(numbers) != count:
+            yield f"{called}{field} must hold {count} numbers or none, not {len(numbers)}"
+        elif not all(abs(number) < _NUMBER.high for number in numbers) or (field == "std" and not all(numbers)):
+            yield f"{called}{field} must hold finite numbers{', not 0' if field == 'std' else ''}: {list(numbers)}"

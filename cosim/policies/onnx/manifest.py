@@ -1,0 +1,159 @@
+"""The manifest of an ONNX bundle, `manifest.json`: what its graph wants, what it answers, and where it comes from.
+
+{"format": 1, "name": "mine", "rate_hz": 5, "goal": "route_point", "camera": {"width": 160, "height": 90},
+ "inputs": {"pictures": {"what": "picture", "frames": 4, "size": [160, 90], "layout": "N(TC)HW"},
+            "goal": {"what": "goal_point", "unit_m": 10}},
+ "output": {"what": "waypoints", "name": "waypoints", "index": 2, "dt_s": 0.6}}
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Annotated, Final, Literal, get_args
+
+import msgspec
+
+from cosim.core.errors import SpecError
+from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
+from cosim.policies.onnx.inputs import GraphInput, JoinedInput, PastPositionsInput, PictureInput
+from cosim.policies.onnx.outputs import GraphOutput, WaypointsOutput
+from cosim.spec.goal import GoalProtocol
+from cosim.spec.odometry import OdometryKind
+from cosim.spec.ranges import Named, Ranged, Text, Within
+from cosim.spec.spec_file import read_spec_file
+
+MANIFEST_FILE: Final = "manifest.json"
+EXAMPLE_FILE: Final = "example.npz"
+"""For each input of the graph an array of its name, and for each output one of the name `expected.<name>`."""
+
+_HASH: Final = re.compile(r"[0-9a-f]{64}")
+
+
+class FileFacts(Ranged, frozen=True, kw_only=True):
+    """How large a file of a bundle is, and a hash of its bytes, in hexadecimal: the BLAKE2b, 32 bytes long, or the
+    SHA-256 where its authors tell that, or both."""
+
+    bytes: Annotated[int, Within(0, 10**12)]
+    blake2b: str = ""
+    sha256: str = ""
+
+    def contradictions(self) -> Iterator[str]:
+        for name, told in self.hashes.items():
+            if told and not _HASH.fullmatch(told):
+                yield f"{name} must be 64 hexadecimal digits, not {told[:80]!r}"
+        if not any(self.hashes.values()):
+            yield "blake2b or sha256 must be given"
+
+    @property
+    def hashes(self) -> dict[str, str]:
+        """By their names; "" for one that is not told."""
+        return {"blake2b": self.blake2b, "sha256": self.sha256}
+
+    @property
+    def in_words(self) -> str:
+        """As a refusal tells it."""
+        told = {"BLAKE2b": self.blake2b, "SHA-256": self.sha256}
+        return ", ".join([f"{self.bytes} bytes", *(f"{name} {one}" for name, one in told.items() if one)])
+
+
+def file_facts(data: bytes) -> FileFacts:
+    """The facts of a file that holds `data`.
+
+    >>> file_facts(b"graph").bytes
+    5
+    """
+    blake2b = hashlib.blake2b(data, digest_size=32).hexdigest()
+    return FileFacts(bytes=len(data), blake2b=blake2b, sha256=hashlib.sha256(data).hexdigest())
+
+
+class BundleCamera(Ranged, frozen=True, kw_only=True):
+    """A camera, as `cosim.episode.ports.CameraSpec` has it; it sits at one of the robot's mounts."""
+
+    width: Annotated[int, Within(1, 4096)]
+    height: Annotated[int, Within(1, 4096)]
+    fov_deg: Annotated[float, Within(0, 180, above=True)] = 75.0
+    mount: Annotated[str, Named("a mount")] = "front"
+    crop: tuple[int, int, int, int] | None = None
+
+    def contradictions(self) -> Iterator[str]:
+        try:
+            _ = self.spec
+        except SpecError as error:
+            yield str(error)
+
+    @property
+    def spec(self) -> CameraSpec:
+        return CameraSpec(self.width, self.height, self.fov_deg, self.mount, crop=self.crop)
+
+
+class BundleManifest(Ranged, frozen=True, kw_only=True):
+    """A manifest. inputs: by the names of the graph's inputs; model: the graph's file in the folder, or of the same
+    name in a folder of weights (`cosim.policies.onnx.weights`); files: what is known of it and of others.
+
+    licence, source: of the weights, in words; a source says where they are to be had.
+    """
+
+    format: Literal[1]
+    name: Annotated[str, Named("a policy")]
+    version: Annotated[str, Named("a version")] = "1"
+    licence: Annotated[str, Text(400)] = ""
+    source: Annotated[str, Text(400)] = ""
+    model: Annotated[str, Named("a file")] = "model.onnx"
+    files: dict[str, FileFacts] = msgspec.field(default_factory=dict)
+    rate_hz: Annotated[float, Within(0, 20, above=True)] = 4.0
+    goal: GoalProtocol = "none"
+    odometry: OdometryKind = "none"
+    camera: BundleCamera | None = None
+    cameras: dict[str, BundleCamera] = msgspec.field(default_factory=dict)
+    inputs: dict[str, GraphInput]
+    output: GraphOutput
+
+    @property
+    def called(self) -> str:
+        return ""
+
+    @property
+    def goals(self) -> tuple[GoalProtocol, ...]:
+        """The goals that all of its inputs can be made of; () where they need none."""
+        wanted = [set(one.needs) for one in self.inputs.values() if one.needs]
+        return tuple(one for one in get_args(GoalProtocol) if wanted and one in set.intersection(*wanted))
+
+    @property
+    def policy(self) -> Manifest:
+        """As a run knows it."""
+        waypoints = self.output.waypoint_rule if isinstance(self.output, WaypointsOutput) else WaypointRule()
+        return Manifest(
+            name=self.name,
+            version=self.version,
+            rate_hz=self.rate_hz,
+            camera=None if self.camera is None else self.camera.spec,
+            waypoints=waypoints,
+            goal=self.goal,
+            odometry=self.odometry,
+            cameras={name: one.spec for name, one in self.cameras.items()},
+            goals=self.goals,
+        )
+
+    def contradictions(self) -> Iterator[str]:
+        needs = {name: one.needs for name, one in self.inputs.items() if one.needs}
+        if needs and not self.goals:
+            yield f"inputs {', '.join(needs)} need goals that no run can give at once: give one of them `missing`"
+        elif self.goals and self.goal not in self.goals:
+            yield f"goal must be one of {', '.join(self.goals)}, of which the inputs are made, not {self.goal!r}"
+        for name, one in self.inputs.items():
+            if isinstance(one, PictureInput):
+                cameras: Mapping[str, BundleCamera | None] = {"": self.camera, **self.cameras}
+                if cameras.get(one.camera) is None:
+                    which = f"cameras has no {one.camera!r}" if one.camera else "camera is null or missing"
+                    yield f"inputs.{name} is a picture, and {which}"
+            parts = one.parts if isinstance(one, JoinedInput) else (one,)
+            if self.odometry in ("none", "gps") and any(isinstance(part, PastPositionsInput) for part in parts):
+                yield f"inputs.{name} holds past positions, and odometry is {self.odometry!r}: say exact or wheel"
+
+
+def read_bundle_manifest(folder: Path) -> BundleManifest:
+    """The manifest of a bundle's folder. Raises SpecError with every fault, its place, and what may stand there."""
+    return read_spec_file(folder / MANIFEST_FILE, BundleManifest)

@@ -1,0 +1,138 @@
+"""From pictures to numbers: cut, size, colour, normalisation, and the order of a tensor's axes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cache
+from typing import Any, Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from cosim.policies.onnx.inputs import PixelsInput, axes_of
+
+_RESAMPLED: Final = {
+    "area": cv2.INTER_AREA,
+    "linear": cv2.INTER_LINEAR,
+    "cubic": cv2.INTER_CUBIC,
+    "nearest": cv2.INTER_NEAREST,
+}
+
+
+def picture_numbers(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[Any]:
+    """One picture (H, W, 3) as a graph sees it: (rows, columns, channels), float32; uint8 where it stays as it is."""
+    pixels = _coloured(_fitted(_cut(rgb, how), how), how.colour)
+    if how.as_they_are:
+        return pixels
+    numbers = _numbers_of_bytes(how)
+    if pixels.shape[2] in (1, 3):
+        looked_up: NDArray[Any] = cv2.LUT(np.ascontiguousarray(pixels), numbers[None])
+        return looked_up.reshape(pixels.shape)
+    return np.stack([numbers[pixels[..., i], i] for i in range(pixels.shape[2])], axis=-1)
+
+
+@cache
+def _numbers_of_bytes(how: PixelsInput) -> NDArray[np.float32]:
+    """(256, channels): what each byte of a channel becomes."""
+    numbers = np.arange(256, dtype=np.float32)[:, None] * np.full(how.channels, 1.0 / how.scale, np.float32)
+    if how.mean:
+        numbers -= np.asarray(how.mean, np.float32)
+    if how.std:
+        numbers /= np.asarray(how.std, np.float32)
+    return numbers
+
+
+def axes_turned(frame: NDArray[Any], layout: str) -> NDArray[Any]:
+    """A frame (H, W, C), its axes in the order in which a layout has these letters; C alone may be absent from it.
+
+    >>> axes_turned(np.zeros((64, 85, 3)), "N(TC)HW").shape
+    (3, 64, 85)
+    """
+    order = [letter for letter in "".join(axes_of(layout)) if letter in "HWC"]
+    return np.ascontiguousarray(frame.transpose(["HWC".index(letter) for letter in order + ["C"] * ("C" not in order)]))
+
+
+def laid_out(frames: Sequence[NDArray[Any]], layout: str) -> NDArray[Any]:
+    """Frames as `axes_turned` gives them with the axes of a layout, in which N is of length 1.
+
+    >>> laid_out([np.zeros((3, 64, 85))] * 6, "N(TC)HW").shape
+    (1, 18, 64, 85)
+    """
+    letters = "".join(axes_of(layout)).replace("N", "")
+    stacked = np.stack(frames, axis=letters.index("T")) if "T" in letters else frames[0]
+    sides = dict(zip(letters, stacked.shape, strict=False))
+    return stacked.reshape(shape_of((sides["H"], sides["W"], sides.get("C", 1)), len(frames), layout))
+
+
+def shape_of(sides: tuple[int, int, int], frames: int, layout: str) -> tuple[int, ...]:
+    """Of a tensor of so many frames with so many rows, columns and channels.
+
+    >>> shape_of((64, 85, 3), 6, "N(TC)HW")
+    (1, 18, 64, 85)
+    """
+    counts = {"N": 1, "T": frames} | dict(zip("HWC", sides, strict=True))
+    return tuple(math.prod(counts[letter] for letter in group) for group in axes_of(layout))
+
+
+def _cut(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
+    """The part of a picture that `crop` names, and of that the part of the shape of `size` where that is asked for."""
+    rows, columns = rgb.shape[:2]
+    if how.crop is not None:
+        x0, y0, x1, y1 = how.crop
+        left, right = _within(x0 * columns, x1 * columns, columns)
+        top, bottom = _within(y0 * rows, y1 * rows, rows)
+        rgb = rgb[top:bottom, left:right]
+        rows, columns = rgb.shape[:2]
+    if how.fit == "crop":
+        width, height = how.size
+        wide = min(columns, max(round(rows * width / height), 1))
+        high = min(rows, max(round(columns * height / width), 1))
+        left, top = (columns - wide) // 2, (rows - high) // 2
+        rgb = rgb[top : top + high, left : left + wide]
+    return rgb
+
+
+def _within(low: float, high: float, most: int) -> tuple[int, int]:
+    """Whole pixels, one at least."""
+    first = min(round(low), most - 1)
+    return first, max(round(high), first + 1)
+
+
+def _fitted(rgb: NDArray[np.uint8], how: PixelsInput) -> NDArray[np.uint8]:
+    """A picture in the size (width, height)."""
+    width, height = how.size
+    if how.fit in ("stretch", "crop"):
+        return _resized(rgb, width, height, how)
+    scale = min(width / rgb.shape[1], height / rgb.shape[0])
+    wide, high = max(round(rgb.shape[1] * scale), 1), max(round(rgb.shape[0] * scale), 1)
+    left, top = ((width - wide) // 2, (height - high) // 2) if how.fit == "letterbox" else (0, 0)
+    whole = np.full((height, width, 3), how.border, np.uint8)
+    whole[top : top + high, left : left + wide] = _resized(rgb, wide, high, how)
+    return whole
+
+
+def _resized(rgb: NDArray[np.uint8], width: int, height: int, how: PixelsInput) -> NDArray[np.uint8]:
+    if rgb.shape[:2] == (height, width):
+        return rgb
+    resized: NDArray[np.uint8] = cv2.resize(
+        np.ascontiguousarray(rgb), (width, height), interpolation=_RESAMPLED[how.resample]
+    )
+    return resized
+
+
+def _coloured(rgb: NDArray[np.uint8], colour: str) -> NDArray[np.uint8]:
+    """(H, W, 3) in other channels; yuv420 as (H / 2, W / 2, 6): Y of even and odd rows at even columns, then at odd
+    ones, U, V."""
+    if colour == "bgr":
+        return rgb[..., ::-1]
+    if colour == "grey":
+        grey: NDArray[np.uint8] = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2GRAY)
+        return grey[..., None]
+    if colour == "yuv420":
+        height, width = rgb.shape[:2]
+        planes = cv2.cvtColor(np.ascontiguousarray(rgb), cv2.COLOR_RGB2YUV_I420)
+        y, uv = planes[:height], planes[height:].reshape(2, height // 2, width // 2)
+        return np.stack([y[::2, ::2], y[1::2, ::2], y[::2, 1::2], y[1::2, 1::2], uv[0], uv[1]], axis=-1)
+    return rgb

@@ -1,0 +1,234 @@
+"""The policy that a bundle's graph is: observations become its inputs, its outputs waypoints or a command."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from cosim.core.errors import PolicyError, UsageError
+from cosim.core.state import STILL, Command
+from cosim.episode.control import command_of
+from cosim.episode.given import calibration_of
+from cosim.episode.ports import Manifest, Observation
+from cosim.policies.onnx.answers import PolicyAnswer, answer_of, check_outputs
+from cosim.policies.onnx.feeding import Feeder
+from cosim.policies.onnx.graph import Graph, Tensor, said_by_runtime
+from cosim.policies.onnx.inputs import StateInput
+from cosim.policies.onnx.manifest import BundleManifest
+from cosim.policies.onnx.reading import read_bundle
+from cosim.policies.onnx.weights import bundle_files
+from cosim.spec.goal import Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.odometry import Odometry
+from cosim.spec.picture import CameraPicture
+from cosim.spec.robot import COURIER
+
+_GREY = 128
+_PATCH_PX = 80
+
+
+def onnx_policy(place: Path) -> OnnxPolicy:
+    """The policy of a bundle. Off the CPU, and where the graph's first axis may be of any length, it answers for many
+    episodes at once. Raises as `OnnxPolicy` does."""
+    policy = OnnxPolicy(place)
+    return policy if policy.graph.on_cpu or not policy.takes_batches else OnnxBatchPolicy(place)
+
+
+class _Memory:
+    """What is kept of one episode."""
+
+    def __init__(self, feeder: Feeder) -> None:
+        self.feeder = feeder
+        self.last: Command = STILL
+
+    def forget(self) -> None:
+        self.feeder.forget()
+        self.last = STILL
+
+
+class OnnxPolicy:
+    """A bundle's policy. Raises UsageError or SpecError, before anything is driven, for whatever of the bundle is
+    missing or does not fit together; it is asked once, in a grey street, to see that.
+
+    bundle: its manifest; digest: a hash of that, of the weights, and of what the graph answers in that street: its last
+    bits hang on the processor, of which runs that are continued or merged must be one kind; example: where its example
+    would be.
+    """
+
+    def __init__(self, place: Path) -> None:
+        found = read_bundle(place)
+        self.bundle, self.example, self.manifest = found.manifest, found.example, found.manifest.policy
+        files = bundle_files(found.folder, self.bundle)
+        self.digest = hashlib.blake2b(msgspec.json.encode(self.bundle) + files.digest.encode()).hexdigest()
+        self.graph = Graph(files.graph)
+        self._check()
+        self._names = [*dict.fromkeys([*self.bundle.output.outputs, *_state_outputs(self.bundle)])]
+        self._memory = self._begun(0)
+        self.digest = hashlib.blake2b(self.digest.encode() + self._try(files.graph)).hexdigest()
+
+    @property
+    def takes_batches(self) -> bool:
+        """Whether the graph can be asked several questions at once, along the first axis of all it takes and tells."""
+        ports = [*self.graph.inputs.values(), *(self.graph.outputs[name] for name in self._names)]
+        layouts = [getattr(one, "layout", "N") for one in self.bundle.inputs.values()]
+        return all(port.shape[:1] == (None,) for port in ports) and all(layout.startswith("N") for layout in layouts)
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing of the episode before is remembered."""
+        self._memory = self._begun(seed)
+
+    def on_reset(self) -> None:
+        """What was seen before is no history."""
+        self._memory.forget()
+
+    def act(self, observation: Observation) -> PolicyAnswer:
+        """Waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
+        return self._answers([self._memory], [observation])[0]
+
+    def _begun(self, seed: int) -> _Memory:
+        return _Memory(Feeder(self.bundle.inputs, self.graph.inputs, seed))
+
+    def _answers(self, memories: Sequence[_Memory], seen: Sequence[Observation]) -> list[PolicyAnswer]:
+        """To one question; to several where the graph takes them."""
+        asked = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
+        if len(asked) == 1:
+            told = [self.graph.ask(asked[0], self._names)]
+        else:
+            whole = {name: np.concatenate([one[name] for one in asked]) for name in asked[0]}
+            all_told = self.graph.ask(whole, self._names)
+            told = [{name: array[i : i + 1] for name, array in all_told.items()} for i in range(len(asked))]
+        return [self._answer(*each) for each in zip(memories, seen, told, strict=True)]
+
+    def _answer(self, memory: _Memory, seen: Observation, told: Mapping[str, Tensor]) -> PolicyAnswer:
+        memory.feeder.remember(told)
+        answer = answer_of(self.bundle.output, told, seen.robot, memory.last)
+        if isinstance(answer, Command):
+            memory.last = answer
+        return answer
+
+    def _check(self) -> None:
+        """Raises UsageError unless graph and manifest have the same inputs, and the graph the outputs."""
+        wanted, given = self.graph.inputs, self.bundle.inputs
+        if lacking := sorted(wanted.keys() - given.keys()):
+            told = "; ".join(f"'{name}' {wanted[name].in_words}" for name in lacking)
+            raise UsageError(f"inputs: the graph wants {told}, of which the manifest says nothing")
+        if over := sorted(given.keys() - wanted.keys()):
+            raise UsageError(f"inputs: the graph has no input '{over[0]}'. Valid choices: {', '.join(wanted)}")
+        check_outputs(self.bundle.output, self.graph.outputs)
+        for name, one in given.items():
+            if isinstance(one, StateInput) and one.output not in self.graph.outputs:
+                choices = ", ".join(self.graph.outputs)
+                raise UsageError(f"inputs.{name}: the graph has no output '{one.output}'. Valid choices: {choices}")
+
+    def _try(self, path: Path) -> bytes:
+        """Asks once, as a run would, and gives the bytes of what the graph answered. Raises UsageError for what the
+        runtime cannot do, and for an answer that is none."""
+        seen = in_grey(self.manifest)
+        try:
+            for _ in range(2):
+                command_of(self._answers([self._memory], [seen])[0], rule=self.manifest.waypoints, robot=seen.robot)
+            told = self.graph.ask(self._memory.feeder.feed(seen), self._names)
+            return b"".join(told[name].tobytes() for name in self._names)
+        except UsageError:
+            raise
+        except PolicyError as error:
+            raise UsageError(f"{path}: in a grey street the policy {error}: are its weights whole?") from error
+        except Exception as error:
+            raise UsageError(f"{path}: cannot be run by onnxruntime: {said_by_runtime(error)}") from error
+
+
+class OnnxBatchPolicy(OnnxPolicy):
+    """The same for many episodes at once (`cosim.episode.ports.BatchPolicy`)."""
+
+    def __init__(self, place: Path) -> None:
+        super().__init__(place)
+        self._memories: dict[str, _Memory] = {}
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Another episode begins."""
+        self._memories[episode_id] = self._begun(seed)
+
+    def on_reset(self, episode_id: str = "") -> None:
+        """What was seen before in this episode is no history."""
+        self._memories[episode_id].forget()
+
+    def ended(self, episode_id: str) -> None:
+        """Nothing more is asked about this episode."""
+        self._memories.pop(episode_id, None)
+
+    def act(self, observation: Observation) -> PolicyAnswer:
+        return self.act_batch([observation])[0]
+
+    def act_batch(self, observations: Sequence[Observation]) -> list[PolicyAnswer]:
+        """For each observation what `act` would answer, up to what the processor makes of the last bits."""
+        return self._answers([self._memories[one.episode] for one in observations], observations)
+
+
+def in_grey(manifest: Manifest) -> Observation:
+    """What a policy might be given: grey pictures, at rest, the goal 10 m ahead."""
+
+    def grey(size: tuple[int, int]) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
+        return np.full((size[1], size[0], 3), _GREY, np.uint8)
+
+    camera = manifest.camera
+    rgb = None if camera is None else grey(camera.size)
+    return Observation(
+        tick=0,
+        time_s=0.0,
+        rgb=rgb,
+        v_mps=0.0,
+        w_radps=0.0,
+        robot=COURIER,
+        goal=_goal_ahead(manifest.goal, rgb),
+        odometry=None if manifest.odometry == "none" else Odometry(0.0, 0.0, 0.0),
+        pictures={
+            name: CameraPicture(grey(one.size), None, None, calibration_of(one, COURIER))
+            for name, one in manifest.cameras.items()
+        },
+    )
+
+
+def example_differences(policy: OnnxPolicy) -> dict[str, float]:
+    """For each output in the bundle's example the largest difference between what the graph tells and what is expected.
+
+    Raises UsageError for a bundle without an example, or with one that does not fit the graph.
+    """
+    path = policy.example
+    try:
+        with np.load(path) as arrays:
+            held: dict[str, Tensor] = {name: arrays[name] for name in arrays.files}
+    except (OSError, ValueError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from error
+    wanted = {name.removeprefix("expected."): array for name, array in held.items() if name.startswith("expected.")}
+    if lacking := sorted(policy.graph.inputs.keys() - held.keys()):
+        raise UsageError(f"{path}: has no array '{lacking[0]}'; it has {', '.join(held)}")
+    if unknown_ones := sorted(wanted.keys() - policy.graph.outputs.keys()):
+        raise UsageError(
+            f"{path}: has expected.{unknown_ones[0]}; the graph's outputs: {', '.join(policy.graph.outputs)}"
+        )
+    try:
+        told = policy.graph.ask({name: held[name] for name in policy.graph.inputs}, list(policy.graph.outputs))
+    except Exception as error:
+        raise UsageError(f"{path}: does not fit the graph: {said_by_runtime(error)}") from error
+    for name, array in wanted.items():
+        if told[name].shape != array.shape:
+            raise UsageError(f"{path}: expected.{name} is {array.shape}, the graph tells {told[name].shape}")
+    return {name: float(np.abs(told[name].astype(float) - array).max(initial=0.0)) for name, array in wanted.items()}
+
+
+def _goal_ahead(protocol: GoalProtocol, rgb: object) -> Goal | None:
+    if protocol in ("image", "random_image"):
+        assert isinstance(rgb, np.ndarray), "pictures as goals need a camera"
+        return ImageGoal(rgb)
+    if protocol == "instruction":
+        return Instruction("Follow the sidewalk.")
+    if protocol == "route_patch":
+        return RoutePatch(np.zeros((_PATCH_PX, _PATCH_PX), np.uint8))
+    return None if protocol == "none" else PointGoal(10.0, 0.0)
+
+
+def _state_outputs(bundle: BundleManifest) -> list[str]:
+    return [one.output for one in bundle.inputs.values() if isinstance(one, StateInput)]
