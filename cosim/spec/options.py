@@ -8,6 +8,7 @@ from typing import Literal
 import msgspec
 
 from cosim.core.errors import UsageError
+from cosim.spec.collecting import Collecting
 from cosim.spec.connection import Connection
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.injection import Injected, Live
@@ -37,8 +38,8 @@ class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
-    """How an episode is run. But for robot and latency, options change what is seen and kept, never what happens in the
-    street.
+    """How an episode is run. But for robot, latency and the noise of collecting, options change what is seen and kept,
+    never what happens in the street.
 
     seed: of the run: what a policy is told in place of the scenario's name and seed is drawn from it
     (`cosim.spec.pseudonym`), and the order of a run's episodes. None: a run draws one anew, an Episode by itself takes
@@ -53,6 +54,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     effect so much later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`).
     real_time: in place of that, the time that the policy takes for an answer on this machine is that answer's latency,
     and it is not asked again before: what comes out is replayed from its record, and not made again from its seed.
+    collecting: the policy is an expert, of whose drive a demonstration is kept.
     Raises UsageError.
 
     >>> EpisodeOptions(camera="bullet", frames_every_s=1.0).camera
@@ -75,6 +77,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     renderer: RendererAt | None = None
     latency_ms: float = 0.0
     real_time: bool = False
+    collecting: Collecting | None = None
 
     def __post_init__(self) -> None:
         check_seed(self.seed)

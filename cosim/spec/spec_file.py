@@ -147,6 +147,9 @@ def _faults_below(tree: Any, kind: Any, place: str) -> Iterator[str]:
                 yield from faults_in(tree[name], field.type, f"{place}.{name}")
             elif field.required:
                 yield f"Object missing required field `{name}` - at `{place}`"
+    elif isinstance(tree, dict) and get_origin(kind) is dict:
+        for name, item in tree.items():
+            yield from faults_in(item, get_args(kind)[1], f"{place}.{printable(name, MOST_SHOWN)}")
     elif isinstance(tree, list) and get_origin(kind) is tuple:
         parts = get_args(kind)
         if parts[-1] is not Ellipsis and len(parts) != len(tree):

@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Sequence
 from contextlib import AbstractContextManager, ExitStack
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from secrets import token_hex
-from typing import Annotated, Any, get_args
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import msgspec
 import typer
@@ -35,14 +36,22 @@ from cosim.cli.terminal.logs import LogJson, LogLevel, logged
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import INTERRUPTED, SOME_CRASHED, UsageError, unknown
 
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from cosim.records.figures import Figures
+    from cosim.spec.scenario import Scenario, Split, Suite
+    from scenarios.execution.transport import HeldRun
+
 run_app = typer.Typer()
-ReachesWorkers = Callable[..., AbstractContextManager[Any]]
 
 _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
 )
 _ISOLATED_HELP = "The policy gets a process of its own and sees observations alone: it cannot reach into the simulator."
-_POLICY_HELP = "A baseline, your own as package.module:Class, or one that is served, as zenoh:NAME."
+_POLICY_HELP = (
+    "One of `cosim list`, your own as package.module:Class, a network as onnx:FOLDER, or a served one as zenoh:NAME."
+)
 _POLICY_AT_HELP = "Where `cosim serve` listens, for --policy zenoh:NAME; may be repeated: servers share the episodes."
 _SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
@@ -110,46 +119,33 @@ def carry_out(
     ] = False,
     log_level: LogLevel = "",
     log_json: LogJson = None,
-    carrier: AbstractContextManager[ReachesWorkers] | None = None,
+    carrier: AbstractContextManager[Any] | None = None,
 ) -> None:
-    """Do what is asked by the options of `cosim run`. carrier: what reaches the workers, in place of processes of this
-    machine, opened before anything is written: (held folder, scenarios to run, those of the run, hello, patience, tell)
-    -> (transport, tell)."""
+    """Do what is asked by the options of `cosim run`. carrier: gives the `Reaches` of workers, in place of processes of
+    this machine; opened before anything is written."""
     from bridge import keys
     from bridge.session import notices_of, open_session
-    from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
     from cosim.records.figures import Going
-    from cosim.records.run_folder import RunFolder
-    from cosim.records.run_spec import Shard
     from cosim.spec.goal import goal_called
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
     from cosim.spec.policy_host import PolicyHost
-    from cosim.spec.robot import COURIER, robot_called
-    from cosim.spec.scenario import Split
     from scenarios.builders.fits import LOOKING, check_places
     from scenarios.catalog import load_suite, scenarios_chosen, with_crowd, with_robot
     from scenarios.execution.asked import Patience
-    from scenarios.execution.messages import Hear, Hello
     from scenarios.execution.pace import announcement, remembered
-    from scenarios.execution.pool import run_all
-    from scenarios.execution.process import LocalProcesses
-    from scenarios.execution.suite_run import check_alone, run_spec, seed_of_run
-    from scenarios.execution.transport import Transport
-    from scenarios.rendering.shared import SharedRenderer, check_shared
-    from scenarios.serving.drivers import known_driver
+    from scenarios.execution.suite_run import by_processes, held_run, planned_run, run_what_is_left
 
     asked_latency_ms(latency, real_time)
+    if resume and folder is None:
+        raise UsageError("--resume needs --out: the folder of the run to finish")
+    if shard and latency == "measured":
+        raise UsageError("--shard with --latency measured: each would measure another: give milliseconds")
     air, away, servers = ends_of_run(live, director, policy_at or (), tls, insecure)
     for line in (line for end in (air, away, *servers) if end is not None for line in notices_of(end)):
         warned(line)
     if map_name is not None:
-        from scenarios.builders.sample import suite_on_map
-
-        with doing(f"drawing routes on {map_name}"):
-            driven_by = robot_called(robot or COURIER.name)
-            whole = suite_on_map(suite, map_name, seed or 0, episodes, roughness or 0.0, event or (), robot=driven_by)
-        err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
+        whole = _drawn(suite, map_name, seed or 0, episodes, roughness or 0.0, event or (), robot)
     elif roughness is not None:
         raise UsageError("--roughness goes with --map: a suite says itself how rough the ground of its places is")
     else:
@@ -159,108 +155,112 @@ def carry_out(
         whole, persons=crowd, vehicles=None if crowd is None else round(VEHICLES_SHARE * crowd),
         residents=residents, groups=groups, elderly=elderly, children=children,
     )  # fmt: skip
-    if split not in (None, *get_args(Split)):
-        raise unknown("split", str(split), get_args(Split))
-    of_run = scenarios_chosen(whole, scenario or (), episodes, event or (), split)
-    part = Shard.called(shard, len(of_run)) if shard else None
-    if part is not None and seed is None and not resume:
-        raise UsageError("--shard needs --seed: shards are of one run, which has one seed: give the same to each")
-    if part is not None and latency == "measured":
-        raise UsageError("--shard with --latency measured: each would measure another: give milliseconds")
-    picked = of_run if part is None else part.share(of_run)
-    host = PolicyHost(isolated=isolated, servers=servers, run=token_hex(8))
-    loaded = known_driver(policy, host, jobs)
-    manifest = loaded.manifest
-    drawn_by = camera_here(camera) if manifest.camera is not None else "bullet"
-    asks = shared_renderer and check_shared(loaded, drawn_by)
+    of_run = scenarios_chosen(whole, scenario or (), episodes, event or (), _split_called(split))
+    options = EpisodeOptions(
+        seed=seed, robot=robot, own_camera=own_camera, goal=goal_called(goal) if goal else None, camera=camera,
+        frames_every_s=frames, counterfactual=counterfactual, real_time=real_time,
+    )  # fmt: skip
+    went_on = folder if resume else None
+    plan = planned_run(
+        whole, of_run, policy, options, shard=shard, jobs=jobs, shared_renderer=shared_renderer,
+        host=PolicyHost(isolated=isolated, servers=servers, run=token_hex(8)),
+        patience=Patience(answer_timeout, start_timeout), resumed=went_on,
+    )  # fmt: skip
+    manifest, picked = plan.driver.manifest, plan.picked
+    if manifest.camera is not None:
+        camera_here(camera)
     check_rerun(rerun, len(picked))
-    if resume and folder is None:
-        raise UsageError("--resume needs --out: the folder of the run to finish")
-    run_seed = seed_of_run(seed, folder if resume else None)
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
-    suffix = "" if part is None else f"-{part.number}-of-{part.of}"
-    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}{suffix}"
     with doing(LOOKING) as looking:
         check_places(whole, picked, looking, jobs if carrier is None else len(os.sched_getaffinity(0)))
-    named = keys.chunk(path.name)
-    on_air = None if air is None else Live(connection=air, run=named)
-    outside = None if away is None else Outside(connection=away, run=named, wait_s=director_wait)
-    options = EpisodeOptions(
-        seed=run_seed,
-        robot=robot,
-        own_camera=own_camera,
-        goal=goal_called(goal) if goal else None,
-        suite_hash=whole.content_hash,
-        camera=drawn_by,
-        frames_every_s=frames,
-        live=on_air,
-        director=outside,
-        counterfactual=counterfactual,
+    options = with_latency(
+        plan.options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz, plan.host
     )
-    went_on = folder if resume else None
-    options = with_latency(options, latency, real_time, went_on, whole, picked[0], policy, manifest.rate_hz, host)
-    check_alone(options, jobs, shared_renderer)
-    spec = run_spec(whole, of_run, policy, loaded, options, shared_renderer, part)
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S")
+    suffix = "" if plan.shard is None else f"-{plan.shard.number}-of-{plan.shard.of}"
+    path = folder or Path("runs") / f"{whole.name}-{manifest.name}-{stamp}{suffix}"
+    named = keys.chunk(path.name)
+    outside = None if away is None else Outside(connection=away, run=named, wait_s=director_wait)
+    plan = plan._replace(options=msgspec.structs.replace(options, director=outside))
+    renderer = plan.spec.renderer
     with ExitStack() as stack:
         counts = stack.enter_context(logged(log_level, log_json))
-        carried = None if carrier is None else stack.enter_context(carrier)
-        if on_air is not None:
-            hub = stack.enter_context(open_session(on_air.connection))
-            options = msgspec.structs.replace(options, live=Live(connection=hub.inside, run=named))
+        reaches = by_processes(jobs) if carrier is None else stack.enter_context(carrier)
+        if air is not None:
+            hub = stack.enter_context(open_session(air))
+            on_air = msgspec.structs.replace(plan.options, live=Live(connection=hub.inside, run=named))
+            plan = plan._replace(options=on_air)
             err.print(f"On the air at {live}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
-        held = RunFolder.resume(path, spec) if resume else RunFolder.create(path, spec, whole)
-        stack.enter_context(held)
-        err.print(
-            f"Seed {run_seed}: what the policy is told that episodes are called is drawn from it.", highlight=False
-        )
-        for note in held.notes:
-            err.print(note, soft_wrap=True, markup=False, highlight=False)
-        done = held.finished()
-        todo = [s for s in picked if s.id not in done]
-        if done:
-            err.print(f"{len(done)} of {len(picked)} episodes are finished already.")
-        if todo and carrier is None:
-            words = announcement(todo, policy, spec.renderer, jobs, counterfactual)
+        run = stack.enter_context(held_run(plan, path, resume=resume))
+        done = {one.id for one in picked} - {one.id for one in run.todo}
+        _tell_of_beginning(run, plan.options.seed)
+        if run.todo and carrier is None:
+            words = announcement(run.todo, policy, renderer, jobs, counterfactual)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         board = Board(picked, done, compared=counterfactual)
-        hello = Hello(policy, manifest, loaded.source_hash, host=host)
-        patience = Patience(answer_timeout, start_timeout)
-        renderer = None
-        if shared_renderer and todo:
-            drawing = SharedRenderer(held.path / "logs", hello, asks=asks, patience=patience)
-            renderer = stack.enter_context(drawing)
-        transport: Transport = LocalProcesses(held.path / "logs", jobs)
-        go = Going(held.path, [s.id for s in todo], counts)
+        go = Going(run.held.path, [s.id for s in run.todo], counts)
         try:
             with ExitStack() as running:
                 running.callback(go.end)
-                tell: Hear = board.tell
-                if carried is None:
-                    running.enter_context(remembered(held, todo, jobs))
-                elif todo:
-                    transport, tell = running.enter_context(carried(held, todo, picked, hello, patience, tell))
+                if carrier is None:
+                    running.enter_context(remembered(run.held, run.todo, jobs))
                 running.enter_context(board.bars)
-                run_all(held, todo, hello, transport, tell=tell, options=options, patience=patience, renderer=renderer)
+                run_what_is_left(plan, run, reaches, board.tell)
         except KeyboardInterrupt:
-            finished = len(held.finished())
+            finished = len(run.held.finished())
             again = shlex.join(a for a in sys.argv[1:] if a != "--resume")
             again += "" if folder else f" --out {shlex.quote(str(path))}"
             err.print(f"Stopped. {finished} of {len(picked)} episodes are finished and kept in {path}.")
             err.print(f"Go on with: cosim {again} --resume", soft_wrap=True)
             raise typer.Exit(INTERRUPTED) from None
-        table = held.finish()
-    print_table(out, table, len(of_run))
-    print_by_kind(out, table, kinds_of(path))
-    if go.figures is not None:
-        err.print(go.figures.in_words, soft_wrap=True, highlight=False)
-    out.print(f"Run folder: {path}", soft_wrap=True)
-    if part is not None:
-        err.print(f"Shard {part.in_words} of the run: `cosim merge` makes one of all.", highlight=False)
+        table = run.held.finish()
+    _tell_of_end(path, table, of_run, go.figures)
+    if plan.shard is not None:
+        err.print(f"Shard {plan.shard.in_words} of the run: `cosim merge` makes one of all.", highlight=False)
     if lacking := [s.id for s in picked if s.id not in set(table["scenario"])]:
         err.print(f"No record of {', '.join(lacking)}: run it again with --resume.", soft_wrap=True, markup=False)
     if lacking or table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
-    write_rerun(path, [scenario.id for scenario in picked], rerun)
+    write_rerun(path, [one.id for one in picked], rerun)
+
+
+def _drawn(
+    suite: str, map_name: str, seed: int, episodes: int | None, roughness: float, events: Sequence[str], robot: str
+) -> Suite:
+    """A suite on another place than its own, and what it is."""
+    from cosim.spec.robot import COURIER, robot_called
+    from scenarios.builders.sample import suite_on_map
+
+    with doing(f"drawing routes on {map_name}"):
+        driven_by = robot_called(robot or COURIER.name)
+        whole = suite_on_map(suite, map_name, seed, episodes, roughness, events, robot=driven_by)
+    err.print(whole.description, soft_wrap=True, highlight=False, markup=False)
+    return whole
+
+
+def _split_called(name: str | None) -> Split | None:
+    from cosim.spec.scenario import Split
+
+    if name not in (None, *get_args(Split)):
+        raise unknown("split", str(name), get_args(Split))
+    return name  # type: ignore[return-value]
+
+
+def _tell_of_beginning(run: HeldRun, seed: int | None) -> None:
+    err.print(f"Seed {seed}: what the policy is told that episodes are called is drawn from it.", highlight=False)
+    for note in run.held.notes:
+        err.print(note, soft_wrap=True, markup=False, highlight=False)
+    if done := len(run.picked) - len(run.todo):
+        err.print(f"{done} of {len(run.picked)} episodes are finished already.")
+
+
+def _tell_of_end(path: Path, table: DataFrame, of_run: Sequence[Scenario], figures: Figures | None) -> None:
+    from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
+
+    print_table(out, table, len(of_run))
+    print_by_kind(out, table, kinds_of(path))
+    if figures is not None:
+        err.print(figures.in_words, soft_wrap=True, highlight=False)
+    out.print(f"Run folder: {path}", soft_wrap=True)
 
 
 @run_app.command(
@@ -277,6 +277,7 @@ def carry_out(
     "`cosim run long-horizon --policy my_robot.policy:Mine --isolated`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --on ray://head.lan:10001`, or `--on ray`  \n"
     "`cosim run long-horizon --policy zenoh:mine --policy-at tcp/127.0.0.1:7449`: see `cosim serve`  \n"
+    "`cosim run reactive --policy onnx:my_network --goal route_point`  \n"
     "`cosim run long-horizon --policy my_robot.policy:Mine --goal route_point`  \n"
     "`cosim run reactive --policy my_robot.policy:Mine --latency 200`, or `--latency measured`, or `--real-time`  \n"
     "`cosim run long-horizon --map sumo-fkk-in --seed 3 --episodes 5`  \n"
@@ -292,8 +293,10 @@ def run_command(
 ) -> None:
     """Run a suite with a policy and print its table."""
     if on:
-        from cosim.cli.runs.on_cluster import carried_by_ray, check_on
+        from scenarios.many.on_ray import by_ray, check_on_ray
 
-        check_on(on, asked)
-        asked["carrier"] = carried_by_ray(on, jobs, asked["policy"])
+        of_here = ("shared_renderer", "real_time", "live", "rerun")
+        check_on_ray(on, {f"--{name.replace('_', '-')}": asked[name] for name in of_here})
+        say = partial(err.print, soft_wrap=True, highlight=False, markup=False)
+        asked["carrier"] = by_ray(on, jobs, asked["policy"], say)
     carry_out(jobs=1 if on else jobs or 1, **asked)

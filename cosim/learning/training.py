@@ -1,0 +1,266 @@
+"""Training: behaviour cloning in steps, each a function of the seed, the data and the step before.
+
+What it has learned is kept every minute in the folder (`checkpoint.pt`), so that a training that was stopped goes on
+where it was and ends as one in one piece would, on the same device. At its end the bundle is written there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from cosim.core.errors import RunError, UsageError, unwritable
+from cosim.core.whole_file import write_whole
+from cosim.learning.bundle import write_bundle
+from cosim.learning.examples import Batch, Examples
+from cosim.learning.graph import parameters_of
+from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, new_parameters, plan, turns_radps
+
+CHECKPOINT: Final = "checkpoint.pt"
+CURVE: Final = "curve.csv"
+_KEPT_EVERY_S: Final = 60.0
+_LOOKED_EVERY: Final = 20
+"""So often in a training the held-out episodes are looked at."""
+_MOST_HELD_OUT: Final = 8192
+_AVERAGED: Final = 0.999
+"""What is shipped are the parameters' moving averages, of so much of the step before."""
+_WARM_UP: Final = 0.03
+_DECAY: Final = 0.01
+_NARROW_RADPS: Final = 0.04
+_WEIGHTS: Final = {"speed": 4.0, "turn": 1.0, "stop": 1.0, "way": 0.5}
+"""Of the parts of the loss."""
+
+TellStep = Callable[[int, Mapping[str, float]], None]
+"""Told of a step, and how the held-out episodes fare."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Training:
+    """How it is done. batch: examples a step; rate: of learning, the highest; device: "" for the GPU if there is one.
+    begin: a bundle whose parameters it begins with, None: with new ones. minutes: it stops by itself after so long, to
+    be gone on with. name: of the policy. Raises UsageError."""
+
+    steps: int = 20_000
+    seed: int = 0
+    batch: int = 256
+    rate: float = 1e-3
+    device: str = ""
+    begin: Path | None = None
+    minutes: float = math.inf
+    name: str = "small"
+
+    def __post_init__(self) -> None:
+        for field in ("steps", "batch", "rate", "minutes"):
+            if not getattr(self, field) > 0:
+                raise UsageError(f"--{field} must be above 0, not {getattr(self, field):g}")
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What must be the same where a training goes on."""
+        return {name: value for name, value in asdict(self).items() if name in ("steps", "seed", "batch", "rate")}
+
+
+@dataclass
+class _State:
+    """Where a training stands. averaged: of the parameters; curve: a row for each look at the held-out episodes."""
+
+    parameters: dict[str, Tensor]
+    averaged: dict[str, Tensor]
+    optimiser: torch.optim.AdamW
+    step: int
+    curve: list[dict[str, float]]
+
+
+def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> bool:
+    """Train on packed demonstrations into a folder; whether it came to its end. resume: go on with what is there, if
+    anything is.
+
+    Raises RunError for data that do not do, for a folder that holds a training that is not to be gone on with, or
+    another one, and where nothing is learned any more; MachineError where the folder cannot be written.
+    """
+    try:
+        return _train(paths, folder, training, resume, tell)
+    except OSError as error:
+        raise unwritable(folder, error) from error
+
+
+def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> bool:
+    device = _device(training.device)
+    torch.manual_seed(training.seed)
+    torch.backends.cudnn.deterministic = True
+    torch.backends.cudnn.allow_tf32 = torch.backends.cuda.matmul.allow_tf32 = True
+    began_s = time.monotonic()
+    kept = folder / CHECKPOINT
+    if kept.exists() and not resume:
+        raise RunError(f"{folder}: holds a training: go on with it by --resume, or choose another folder")
+    begin = None if training.begin is None or kept.exists() else parameters_of(training.begin / "model.onnx")
+    examples = Examples(paths, training.seed, device)
+    folder.mkdir(parents=True, exist_ok=True)
+    spec = training.spec | {"rows": len(examples.learned), "held_out": len(examples.held_out)}
+    state = _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
+    saved_s = time.monotonic()
+    look_every = max(1, training.steps // _LOOKED_EVERY)
+    while state.step < training.steps:
+        lost = _stepped(state, examples, training)
+        state.step += 1
+        if state.step % look_every == 0 or state.step == training.steps:
+            row = {"step": float(state.step), **lost, **_errors(state.averaged, examples)}
+            if not math.isfinite(sum(row.values())):
+                raise RunError(
+                    f"{folder}: nothing is learned any more at step {state.step}: train anew, at a lower --rate"
+                )
+            state.curve.append(row)
+            _write_curve(folder, state.curve)
+            tell(state.step, row)
+        if time.monotonic() - began_s > 60.0 * training.minutes:
+            break
+        if time.monotonic() - saved_s > _KEPT_EVERY_S:
+            _write(kept, state, spec)
+            saved_s = time.monotonic()
+            tell(state.step, {})
+    _write(kept, state, spec)
+    if whole := state.step == training.steps:
+        write_bundle(folder, state.averaged, examples, training.name, training.seed)
+    return whole
+
+
+def _device(name: str) -> torch.device:
+    if not name:
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise UsageError(f"device '{name}' is not to be had: {str(error).splitlines()[0]}: try cpu") from error
+    return device
+
+
+def _begun(training: Training, begin: dict[str, Tensor] | None, device: torch.device) -> _State:
+    drawn = new_parameters(training.seed) if begin is None else begin
+    parameters = {name: value.to(device).requires_grad_() for name, value in drawn.items()}
+    averaged = {name: value.detach().clone() for name, value in parameters.items()}
+    return _State(parameters, averaged, _optimiser(parameters, training), 0, [])
+
+
+def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.optim.AdamW:
+    return torch.optim.AdamW(parameters.values(), lr=training.rate, weight_decay=_DECAY)
+
+
+def _stepped(state: _State, examples: Examples, training: Training) -> dict[str, float]:
+    """One step on; the parts of its loss."""
+    step, warm = state.step, max(1.0, _WARM_UP * training.steps)
+    share = min((step + 1) / warm, 0.5 * (1.0 + math.cos(math.pi * step / training.steps)))
+    for group in state.optimiser.param_groups:
+        group["lr"] = training.rate * share
+    parts = losses(state.parameters, examples.drawn(training.seed, step, training.batch))
+    state.optimiser.zero_grad(set_to_none=True)
+    torch.stack([_WEIGHTS[name] * part for name, part in parts.items()]).sum().backward()
+    torch.nn.utils.clip_grad_norm_(state.parameters.values(), 1.0)
+    state.optimiser.step()
+    kept = min(_AVERAGED, (1.0 + step) / (10.0 + step))
+    with torch.no_grad():
+        torch._foreach_lerp_(
+            list(state.averaged.values()), [one.detach() for one in state.parameters.values()], 1.0 - kept
+        )
+    if (step + 1) % max(1, training.steps // _LOOKED_EVERY) and step + 1 < training.steps:
+        return {}
+    return {f"{name}_loss": float(part.detach()) for name, part in parts.items()}
+
+
+def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
+    """The parts of the loss. Speed and turn count where the expert does not stop; the way where it was driven."""
+    said = answers(parameters, batch.pictures, batch.goal, batch.speeds)
+    goes = 1.0 - batch.stop
+    per_goer = 1.0 / goes.sum().clamp(min=1.0)
+    off = turns_radps(batch.turn.device) - batch.turn[:, None]
+    near = (-0.5 * (off / _NARROW_RADPS) ** 2).softmax(1)  # the bin of the expert's turn, and a little its neighbours
+    turn = -(near * said.turn.log_softmax(1)).sum(1)
+    speed = functional.smooth_l1_loss(said.speed, batch.speed, reduction="none", beta=0.1)
+    way = functional.smooth_l1_loss(said.way, batch.way, reduction="none", beta=0.2).sum(2)
+    return {
+        "speed": (speed * goes).sum() * per_goer,
+        "turn": (turn * goes).sum() * per_goer / math.log(TURN_BINS),
+        "stop": functional.binary_cross_entropy_with_logits(said.stop, batch.stop),
+        "way": (way * batch.driven).sum() / batch.driven.sum().clamp(min=1.0),
+    }
+
+
+def _errors(parameters: Parameters, examples: Examples) -> dict[str, float]:
+    """Of the held-out episodes: mean errors of speed and turn where both go, share of right and of missed stops, and
+    the last waypoint's mean error."""
+    rows = examples.held_out
+    rows = rows[:: max(1, -(-len(rows) // _MOST_HELD_OUT))]
+    sums: dict[str, float] = dict.fromkeys(
+        ("loss", "goers", "speed", "turn", "stops", "seen", "said", "ends", "way"), 0
+    )
+    with torch.no_grad():
+        for part in np.array_split(rows, max(1, len(rows) // 512)):
+            batch = examples.rows(part)
+            said = answers(parameters, batch.pictures, batch.goal, batch.speeds)
+            planned, stops = plan(said), said.stop > 0.0
+            both = (batch.stop == 0.0) & ~stops
+            speeds = planned[:, 0, 2:] - torch.stack([CRUISE_MPS * batch.speed, batch.turn], 1)
+            off_m = (said.way[:, -1] - batch.way[:, -1]).norm(dim=1)
+            parts = losses(parameters, batch)
+            whole = sum(_WEIGHTS[name] * float(value) for name, value in parts.items())
+            for name, value in (
+                ("loss", whole * len(part)), ("goers", both.sum()), ("speed", speeds[both, 0].abs().sum()),
+                ("turn", speeds[both, 1].abs().sum()), ("stops", batch.stop.sum()),
+                ("seen", (stops & (batch.stop > 0.0)).sum()), ("said", stops.sum()),
+                ("ends", batch.driven[:, -1].sum()), ("way", (off_m * batch.driven[:, -1]).sum()),
+            ):  # fmt: skip
+                sums[name] += float(value)
+    goers, ends = max(sums["goers"], 1.0), max(sums["ends"], 1.0)
+    return {
+        "held_out_loss": sums["loss"] / max(len(rows), 1),
+        "speed_error_mps": sums["speed"] / goers,
+        "turn_error_radps": sums["turn"] / goers,
+        "way_error_m": sums["way"] / ends,
+        "stops_found": sums["seen"] / max(sums["stops"], 1.0),
+        "stops_right": sums["seen"] / max(sums["said"], 1.0),
+    }
+
+
+def _write(path: Path, state: _State, spec: dict[str, Any]) -> None:
+    part = path.with_name(path.name + ".part")
+    held = {
+        "spec": spec,
+        "step": state.step,
+        "curve": state.curve,
+        "parameters": {name: value.detach() for name, value in state.parameters.items()},
+        "averaged": state.averaged,
+        "optimiser": state.optimiser.state_dict(),
+    }
+    torch.save(held, part)
+    part.replace(path)
+
+
+def _read(path: Path, training: Training, spec: dict[str, Any], device: torch.device) -> _State:
+    """What was kept. Raises RunError where it is of another training."""
+    try:
+        held = torch.load(path, map_location="cpu", weights_only=True)
+        was, curve = held["spec"], held["curve"]
+        parameters = {name: value.to(device).requires_grad_() for name, value in held["parameters"].items()}
+        optimiser = _optimiser(parameters, training)
+        optimiser.load_state_dict(held["optimiser"])
+        averaged, step = {name: value.to(device) for name, value in held["averaged"].items()}, held["step"]
+    except Exception as error:
+        raise RunError(f"{path}: cannot be gone on with: {error}: delete it and train anew") from error
+    if different := [name for name in spec if was.get(name) != spec[name]]:
+        told = ", ".join(f"{name} {was.get(name)}, not {spec[name]}" for name in different)
+        raise RunError(f"{path}: of another training: {told}: go on as it was begun, or choose another folder")
+    return _State(parameters, averaged, optimiser, step, curve)
+
+
+def _write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
+    lines = [",".join(curve[0]), *(",".join(f"{value:.6g}" for value in row.values()) for row in curve)]
+    write_whole(folder / CURVE, ("\n".join(lines) + "\n").encode())

@@ -1,0 +1,60 @@
+#!/usr/bin/env bash
+# From nothing to the table of a small policy: demonstrations, training, fine-tuning with three seeds, scores, comparison.
+#
+#   scenarios/examples/small_policy.sh WORK
+#
+# Works in pieces: stops after MINUTES (9 by default) and goes on where it was when called again, until it says "all done".
+# JOBS: processes that simulate (16). COSIM: the command (cosim). PYTHON: the one that has PyTorch, onnx and numpy, any from
+# 3.11 on (python3); it needs nothing else of this project but its folder. Made for 16 cores and a GPU; on two cores set
+# OMP_NUM_THREADS=1 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500), and fewer steps by
+# STEPS (16000) and MORE (8000, of the fine-tuning). EVENTS: which are learned (all eight). MALLOC_...: memory of a step is
+# kept for the next one; giving it back and taking it again was a third of the time.
+set -uo pipefail
+here=$(cd "$(dirname "$0")/../.." && pwd)
+W=${1:?a folder to work in}
+END=$((SECONDS + ${MINUTES:-9} * 60))
+JOBS=${JOBS:-16} COSIM=${COSIM:-cosim} PYTHON=${PYTHON:-python3}
+EVENTS=${EVENTS:-"obstructing conversing queueing frontal lateral overtaking ped_crossing gesturing"}
+mkdir -p "$W/demos/events" "$W/nets" "$W/runs"
+
+step() { # name, words...: a command that can be interrupted and gone on with; done once
+  local name=$1 left=$((END - SECONDS)); shift
+  mkdir -p "$(dirname "$W/log/$name")"
+  [ -e "$W/log/$name.done" ] && return 0
+  [ $left -gt 30 ] || { echo "time is up before $name: call again"; exit 1; }
+  timeout -k 30 $left "$@" >> "$W/log/$name.txt" 2>&1 || { tail -n 3 "$W/log/$name.txt"; echo "stopped in $name: call again"; exit 1; }
+  touch "$W/log/$name.done"; echo "$name: done"
+}
+learn() { # name, words...
+  local name=$1; shift
+  step "train-$name" env PYTHONPATH="$here" MALLOC_MMAP_THRESHOLD_=4000000000 MALLOC_TRIM_THRESHOLD_=8000000000 \
+    "$PYTHON" -m cosim.learning "$@" -o "$W/nets/$name" \
+    --batch "${BATCH:-256}" \
+    --minutes "$(awk "BEGIN { print ($END - $SECONDS) / 60 - 0.3 }")" --resume
+}
+collect() { # name, words...
+  local name=$1; shift
+  step "collect-$name" $COSIM collect "$@" --cities 900:940 --noise 0.2 --fov 60 --jobs "$JOBS" --out "$W/demos/$name" --resume
+}
+score() { # name, policy, suite
+  local more=(); [ -e "$W/runs/$3-$1/run.json" ] && more=(--resume)
+  step "run-$3-$1" $COSIM run "$3" --split test --seed 1 --jobs "$JOBS" --policy "$2" --out "$W/runs/$3-$1" "${more[@]}"
+}
+
+collect unit unit --episodes "${UNIT:-1500}"
+for event in $EVENTS; do
+  collect "events/$event" reactive --event "$event" --episodes "${EACH:-500}"
+done
+step pack-unit $COSIM dataset pack "$W/demos/unit" -o "$W/unit.npz"
+step pack-events $COSIM dataset pack "$W"/demos/events/* -o "$W/events.npz"
+learn small "$W/unit.npz" --steps "${STEPS:-16000}"
+for seed in 0 1 2; do
+  learn small-reactive-$seed "$W/events.npz" "$W/unit.npz" --from "$W/nets/small" --seed $seed --steps "${MORE:-8000}" \
+    --rate 3e-4 --name small-reactive
+done
+for suite in unit reactive long-horizon; do
+  for net in small small-reactive-0 small-reactive-1 small-reactive-2; do score $net "onnx:$W/nets/$net" $suite; done
+done
+step compare $COSIM compare "$W"/runs/reactive-small{,-reactive-0,-reactive-1,-reactive-2} -o "$W/finetuning.md"
+cat "$W/finetuning.md"
+echo "all done"

@@ -1,0 +1,276 @@
+"""Training a small policy on demonstrations: `cosim train`. Needs PyTorch, which the lock files leave out."""
+
+from __future__ import annotations
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.errors import CosimError
+from cosim.core.packed import Packed
+from cosim.episode.ports import CameraSpec, Observation
+from cosim.policies.onnx.feeding import Feeder
+from cosim.policies.onnx.graph import TensorPort
+from cosim.policies.onnx.manifest import BundleManifest
+from cosim.spec.goal import PointGoal
+from cosim.spec.robot import COURIER
+
+torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'sidewalk-cosim[train]'")
+onnx = pytest.importorskip("onnx")
+
+from cosim.learning.bundle import manifest_of  # noqa: E402
+from cosim.learning.examples import Examples, mirror  # noqa: E402
+from cosim.learning.graph import INPUTS, graph_of, parameters_of  # noqa: E402
+from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, new_parameters  # noqa: E402
+from cosim.learning.training import Training, train  # noqa: E402
+
+CPU = torch.device("cpu")
+BRISK = Training(steps=4, batch=4, device="cpu")
+
+
+def street(episodes: int = 12, length: int = 4, seed: int = 1) -> Packed:
+    """Episodes in which somebody white stands at the left or at the right, which the expert turns away from, or
+    somebody dark right ahead, for whom it stops."""
+    draws, count = np.random.default_rng(seed), episodes * length
+    scene = np.repeat(np.arange(episodes) % 3, length)
+    frames = draws.integers(90, 110, (count, HEIGHT_PX, WIDTH_PX, 3)).astype(np.uint8)
+    frames[scene == 0, 20:70, 10:60] = 250
+    frames[scene == 1, 20:70, 100:150] = 250
+    frames[scene == 2, 20:70, 60:100] = 10
+    turn = np.array([-0.4, 0.4, 0.0], np.float32)[scene]
+    speed = np.array([1.4, 1.4, 0.0], np.float32)[scene]
+    ahead = 0.2 * np.arange(1, WAYPOINTS + 1, dtype=np.float32)
+    way = np.stack([speed[:, None] * ahead, (speed * turn)[:, None] * ahead**2 / 2], 2)
+    return Packed(
+        frames=frames,
+        state=np.stack([speed, turn], 1),
+        goal=np.tile(np.float32([12.0, 0.0]), (count, 1)),
+        command=np.stack([speed, turn], 1),
+        waypoints=way,
+        driven=np.full(count, WAYPOINTS, np.int32),
+        disturbed=np.zeros(count, bool),
+        episode=np.repeat(np.arange(episodes, dtype=np.int32), length),
+        frame=np.tile(np.arange(length, dtype=np.int32), episodes),
+        meta={
+            "rate_hz": 5.0, "waypoint_s": 0.2, "goal": "route_point", "policy": ["orca"], "robot": "courier",
+            "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
+        },
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("packed") / "street.npz"
+    street().save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A bundle that has learned from that street."""
+    folder = tmp_path_factory.mktemp("learned")
+    assert train([data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([]))
+    return folder
+
+
+def heard(rows: list[dict[str, float]]) -> Any:
+    return lambda step, row: rows.append(dict(row)) if row else None
+
+
+def plans(folder: Path, rows: Sequence[int]) -> np.ndarray:
+    """(rows, WAYPOINTS, 4): what the shipped graph answers to pictures of another street."""
+    ort = pytest.importorskip("onnxruntime")
+    path = folder / "unseen.npz"
+    street(episodes=3, length=1, seed=9).save(path)
+    batch, session = Examples([path], 0, CPU).rows(np.array(rows)), ort.InferenceSession(folder / "model.onnx")
+    inputs = [one.name for one in session.get_inputs()]
+    return np.concatenate(
+        [session.run(None, {name: getattr(batch, name)[i : i + 1].numpy() for name in inputs})[0] for i in rows]
+    )
+
+
+def test_it_learns_to_turn_away_and_to_stop(learned: Path) -> None:
+    """To pictures of a street that it has not seen it answers a turn to the free side, and of somebody ahead that it
+    stops, which is no slow speed but 0."""
+    left, right, ahead = plans(learned, [0, 1, 2])
+    assert left[0, 3] < -0.1 and right[0, 3] > 0.1
+    assert min(left[0, 2], right[0, 2]) > 0.5 * CRUISE_MPS
+    np.testing.assert_array_equal(ahead, 0.0)
+
+
+def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
+    """Its manifest is a bundle's, with the graph's size and hash, no larger than 8 MB; its example answers as said."""
+    manifest = msgspec.json.decode((learned / "manifest.json").read_bytes(), type=BundleManifest)
+    graph = (learned / "model.onnx").read_bytes()
+    told, digest = manifest.files["model.onnx"], hashlib.blake2b(graph, digest_size=32).hexdigest()
+    assert (told.bytes, told.blake2b) == (len(graph), digest) and len(graph) < 8_000_000
+    assert (manifest.goal, manifest.rate_hz, manifest.camera.spec.size) == ("route_point", 5.0, (160, 90))
+    example = np.load(learned / "example.npz")
+    session = pytest.importorskip("onnxruntime").InferenceSession(graph)
+    answer = session.run(["plan"], {name: example[name] for name in manifest.inputs})[0]
+    np.testing.assert_allclose(answer, example["expected.plan"], atol=1e-4)
+
+
+def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
+    """The bundle's camera has the size, the field of view, the place and the crop of that of the demonstrations."""
+    camera = {"width": 160, "height": 120, "fov_deg": 60.0, "mount": "front", "crop": [0, 30, 160, 120], "depth": False}
+    manifest = msgspec.convert(manifest_of("small", street().meta | {"camera": camera}, 0), BundleManifest)
+    assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
+
+
+def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_path: Path) -> None:
+    """Stopped after each step and gone on with, it writes the same graph to the byte, and the same curve."""
+    assert train([data], tmp_path / "whole", BRISK, False, heard([]))
+    pieces = 1
+    while not train([data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])):
+        assert not (tmp_path / "pieces" / "model.onnx").exists()
+        pieces += 1
+    assert pieces == BRISK.steps
+    for name in ("model.onnx", "curve.csv"):
+        assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_it_can_be_trained_on_from_the_shipped_graph_alone(learned: Path, data: Path, tmp_path: Path) -> None:
+    """The graph holds the parameters that training begins with: at a rate of next to nothing it stays as it is."""
+    held = parameters_of(learned / "model.onnx")
+    assert train([data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([]))
+    for name, value in parameters_of(tmp_path / "on" / "model.onnx").items():
+        torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
+    drawn = new_parameters(3)
+    (tmp_path / "drawn.onnx").write_bytes(graph_of(drawn))
+    assert all(torch.equal(value, drawn[name]) for name, value in parameters_of(tmp_path / "drawn.onnx").items())
+
+
+def test_the_mirror_exchanges_left_and_right_everywhere(data: Path) -> None:
+    """Picture, goal, speeds, turn and way are mirrored together: twice is as before, and the street with somebody at
+    the left becomes the one with somebody at the right."""
+    batch = Examples([data], 0, CPU).rows(np.array([0, 4]))
+    there, back = mirror(batch), mirror(mirror(batch))
+    assert all(torch.equal(value, getattr(back, name)) for name, value in vars(batch).items())
+    bright = there.pictures[0] > 0.8
+    assert torch.equal(bright, batch.pictures[1] > 0.8)
+    torch.testing.assert_close(there.turn[0], batch.turn[1])
+    torch.testing.assert_close(there.way[0], batch.way[1])
+
+
+def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
+    """By the bundle's manifest an observation becomes the numbers that the row of it was in training, with its history,
+    also at an episode's beginning, and with a goal farther than is told."""
+    draws, packed = np.random.default_rng(5), street(episodes=2, length=6)
+    goals = draws.uniform(-30.0, 30.0, (12, 2)).astype(np.float32)
+    packed = replace(packed, frames=draws.integers(0, 256, packed.frames.shape, np.uint8), goal=goals)
+    packed.save(tmp_path / "street.npz")
+    trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
+    manifest = msgspec.convert(manifest_of("small", packed.meta, 0), BundleManifest)
+    ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
+    feeder = Feeder(manifest.inputs, ports, 0)
+    for row, (rgb, speeds, goal) in enumerate(zip(packed.frames, packed.state, packed.goal, strict=True)):
+        if packed.frame[row] == 0:
+            feeder.forget()
+        v_mps, w_radps, x_m, y_m = map(float, (*speeds, *goal))
+        fed = feeder.feed(Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m)))
+        for name, tensor in fed.items():
+            np.testing.assert_allclose(tensor[0], getattr(trained_on, name)[row], atol=1e-6)
+
+
+def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
+    """The same step gives the same batch in any order, another one other pictures, within 0 and 1."""
+    examples = Examples([data], 0, CPU)
+    third = examples.drawn(0, 3, 8)
+    other, again = examples.drawn(0, 4, 8), examples.drawn(0, 3, 8)
+    assert all(torch.equal(value, getattr(again, name)) for name, value in vars(third).items())
+    assert not torch.equal(third.pictures, other.pictures)
+    assert float(third.pictures.min()) >= 0.0 and float(third.pictures.max()) <= 1.0
+    assert not torch.equal(third.pictures, examples.rows(examples.learned[:8]).pictures)
+
+
+def test_moments_in_which_the_expert_stops_are_drawn_more_often_than_they_come(tmp_path: Path) -> None:
+    """It drives all along, but for one row of each episode in which it stops: these are a sixteenth of all rows, and a
+    third of those that are drawn. Where it never stops nothing is drawn otherwise."""
+    going = street(length=16)
+    going.state[:, 0] = going.command[:, 0] = 1.4
+    going.save(tmp_path / "goes.npz")
+    assert Examples([tmp_path / "goes.npz"], 0, CPU).drawn(0, 0, 64).stop.sum() == 0
+    going.command[going.frame == 9, 0] = 0.0
+    going.save(tmp_path / "stops.npz")
+    share = float(Examples([tmp_path / "stops.npz"], 0, CPU).drawn(0, 0, 400).stop.mean())
+    assert 0.25 < share < 0.45
+
+
+def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -> None:
+    """No episode is on both sides, and none is on neither."""
+    examples, episode = Examples([data, data], 0, CPU), np.repeat(np.arange(24), 4)
+    learned, held_out = ({*episode[rows].tolist()} for rows in (examples.learned, examples.held_out))
+    assert not learned & held_out and learned | held_out == {*range(24)} and held_out
+    assert len(examples.learned) + len(examples.held_out) == 96
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        ("size", r"other\.npz: pictures of 80 x 90 pixels, wanted are 160 x 90: cosim collect --camera 160x90"),
+        ("goal", r"other\.npz: goals are no points \(none\): cosim collect --goal route_point"),
+        ("turn", r"other\.npz: the expert turns at 1\.20 rad/s, and this network at 0\.65 at most"),
+        ("rate", r"other\.npz: rate_hz is 10\.0, and 5\.0 in .*street\.npz"),
+        ("file", r"other\.npz: no packed demonstrations"),
+        ("begin", r"model\.onnx: cannot be read: No such file"),
+        ("graph", r"model\.onnx: no ONNX graph"),
+        ("folder", r"holds a training: go on with it by --resume"),
+        ("another", r"of another training: seed 0, not 1"),
+        ("device", r"device 'abacus' is not to be had: .* try cpu"),
+        ("steps", r"--steps must be above 0, not 0"),
+    ],
+)
+def test_what_cannot_be_trained_on_is_refused(data: Path, tmp_path: Path, wrong: str, told: str) -> None:
+    """Each is one line that names file and field, what was found and what is wanted, and nothing is written."""
+    packed, other, out = street(episodes=2), tmp_path / "other.npz", tmp_path / "out"
+    if wrong == "size":
+        packed = replace(packed, frames=packed.frames[:, :, ::2])
+    elif wrong == "goal":
+        packed = replace(packed, goal=packed.goal * np.nan, meta=packed.meta | {"goal": "none"})
+    elif wrong == "turn":
+        packed = replace(packed, command=packed.command * np.float32([1.0, 3.0]))
+    elif wrong == "rate":
+        packed = replace(packed, meta=packed.meta | {"rate_hz": 10.0})
+    packed.save(other)
+    if wrong == "file":
+        other.write_bytes(b"PK")
+    if wrong in ("folder", "another"):
+        train([data], out, replace(BRISK, minutes=1e-9), False, heard([]))
+    if wrong == "graph":
+        (tmp_path / "model.onnx").write_bytes(b"\xff\xff")
+    before = sorted(out.rglob("*"))
+    with pytest.raises(CosimError, match=told):
+        training = replace(
+            BRISK,
+            begin=tmp_path if wrong in ("begin", "graph") else None,
+            device="abacus" if wrong == "device" else "cpu",
+            seed=int(wrong == "another"),
+            steps=0 if wrong == "steps" else BRISK.steps,
+        )
+        train(
+            [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data],
+            out,
+            training,
+            wrong == "another",
+            heard([]),
+        )
+    assert sorted(out.rglob("*")) == before
+
+
+def test_it_needs_nothing_but_pytorch_numpy_and_onnx() -> None:
+    """What the project has besides is not imported by a training: a GPU host's own Python can do it."""
+    code = (
+        "import sys, cosim.learning.progress; print(sorted({m.partition('.')[0] for m in sys.modules} & "
+        "{'msgspec', 'shapely', 'pandas', 'scipy', 'cv2', 'av', 'typer', 'rich', 'onnxruntime', 'libsumo'}))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[]"

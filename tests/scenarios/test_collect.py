@@ -1,0 +1,213 @@
+"""`cosim collect`: what it writes is what was driven, whatever stopped it and however many processes drove."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+import pytest
+
+from cosim.core.packed import Packed, read_packed
+from cosim.core.state import Command
+from cosim.episode.driver import Driver
+from cosim.episode.log import Log
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.place.walk_graph import WalkGraph
+from cosim.policies.load import load_policy
+from cosim.records.run_folder import DEMONSTRATION
+from cosim.spec.collecting import Collecting
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.scenario import City, Scenario, Suite, write_suite
+from scenarios.builders.unit import build_unit
+from scenarios.collecting.demonstration import Demonstration
+from scenarios.collecting.demonstrator import Demonstrator
+from scenarios.execution.places import place
+from scenarios.execution.run import run_episode
+from tests.conftest import WIDE, Cosim
+
+pytestmark = pytest.mark.engine
+NOISY = Collecting(camera=CameraSpec(width=64, height=48), noise=0.3)
+ASKED = ("collect", "ways.json", "--episodes", "3", "--camera", "64x48", "--noise", "0.3", "--out", "demos")
+
+
+class Desk(NamedTuple):
+    """A folder with ways.json, and three demos collected of it. ways: 3 to 4 m straight on; the second of the four has
+    no time for that."""
+
+    folder: Path
+    ways: tuple[Scenario, ...]
+    said: str
+
+    @property
+    def solved(self) -> tuple[Scenario, ...]:
+        return self.ways[0], *self.ways[2:]
+
+    def kept(self, way: Scenario) -> Path:
+        (folder,) = self.folder.glob(f"demos/runs/*/episodes/{way.id}")
+        return folder
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Desk:
+    """Collecting was begun by two processes, killed when one episode was over, and gone on with by one."""
+    folder = tmp_path_factory.mktemp("desk")
+    where = City(seed=1, size_m=500.0)
+    _, street_map = place(where)
+    graph = WalkGraph(street_map)
+    drawn = [build_unit("straight", where, street_map, graph, k, f"way-{k}", way_m=(3.0, 4.0)) for k in range(4)]
+    ways = (drawn[0], msgspec.structs.replace(drawn[1], time_limit_s=0.5), *drawn[2:])
+    write_suite(Suite(name="ways", version="1", scenarios=ways), folder / "ways.json")
+    command = [sys.executable, "-m", "cosim", *ASKED, "--jobs", "2"]
+    with subprocess.Popen(
+        command, cwd=folder, env=os.environ | WIDE, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True
+    ) as begun:
+        assert begun.stderr is not None
+        assert any("done, 1 of 3" in line for line in begun.stderr)
+        begun.kill()
+    assert not (folder / "demos/meta").exists()
+    said = cosim(*ASKED, "--resume", cwd=folder)
+    assert said.returncode == 0, said.stderr
+    return Desk(folder, ways, said.stdout)
+
+
+@pytest.fixture(scope="module")
+def packed(desk: Desk, cosim: Cosim) -> Packed:
+    said = cosim("dataset", "pack", "demos", "-o", "demos.npz", cwd=desk.folder)
+    assert said.returncode == 0, said.stderr
+    return read_packed(desk.folder / "demos.npz")
+
+
+def shown_here(way: Scenario, expert: Driver, collecting: Collecting = NOISY) -> Demonstration:
+    """The demonstration of an episode that this process drives."""
+    demonstrator = Demonstrator(expert, collecting, "route_point")
+    options = EpisodeOptions(goal="route_point", seed=0)
+    outcome = run_episode(way, demonstrator, options)
+    return Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
+
+
+def test_what_was_killed_and_went_on_is_to_the_byte_what_one_process_drives(desk: Desk, packed: Packed) -> None:
+    """Each demonstration has the bytes of one that is driven here, in one go; the data set has its rows, in the order
+    of the suite; what was not solved is told and left out, and a further scenario is driven in its place."""
+    shown = [shown_here(way, load_policy("orca")) for way in desk.solved]
+    assert [(desk.kept(way) / DEMONSTRATION).read_bytes() for way in desk.solved] == [one.encoded() for one in shown]
+    for name in ("state", "goal", "command", "waypoints", "driven", "disturbed"):
+        np.testing.assert_array_equal(getattr(packed, name), np.concatenate([getattr(one, name) for one in shown]))
+    assert packed.meta["scenarios"] == [way.id for way in desk.solved]
+    assert "(3 episodes, " in desk.said
+    assert "Dropped 1 that were not solved: ended by timeout: 1" in desk.said
+    assert not (desk.kept(desk.ways[1]) / DEMONSTRATION).exists()
+
+
+def test_rows_are_of_the_ticks_at_which_their_pictures_were_taken(desk: Desk, packed: Packed) -> None:
+    """Row k of an episode is of tick 4 k: its speeds are those that the trajectory has there, its command is what was
+    driven then unless it was disturbed, and its next waypoint is where the robot was 4 ticks later."""
+    assert packed.disturbed.any()
+    for number, way in enumerate(desk.solved):
+        log, rows = Log.load(desk.kept(way) / "trajectory.npz"), packed.episode == number
+        speed, pose = (np.vstack([first, all_]) for first, all_ in (((0, 0), log.speed), (way.start, log.pose)))
+        ticks = 4 * packed.frame[rows]
+        np.testing.assert_allclose(packed.state[rows], speed[ticks], atol=1e-6)
+        as_driven = np.abs(packed.command[rows] - log.command[ticks]).max(axis=1) < 1e-6
+        assert (as_driven | packed.disturbed[rows]).all()
+        there = packed.driven[rows] > 0
+        far_m = np.hypot(*(pose[ticks[there] + 4] - pose[ticks[there]])[:, :2].T)
+        np.testing.assert_allclose(np.hypot(*packed.waypoints[rows][there, 0].T), far_m, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        (("--resume", "--noise", "0.1"), "is of another data set: its noise is 0.3, now asked for is 0.1."),
+        (("--resume", "--policy", "social_force"), "its policy is orca, now asked for is social_force."),
+        (("--resume", "--seed", "5"), "is of another data set: its seed is 0, now asked for is 5."),
+        ((), "demos already holds a data set, or a part of one. Add --resume"),
+        (("--out", "."), ". exists and is no data set. Choose another --out."),
+        (("--goal", "image"), "give --goal, one of none, route_point, final_point, instruction"),
+        (("--camera", "160"), "--camera 160: give width x height in pixels, such as 160x90"),
+        (("--cities", "900:901"), "unknown suite for --cities 'ways.json'. Valid choices: reactive, unit"),
+        (("--cities", "900:901", "--split", "val"), "--cities and --split do not go together"),
+    ],
+    ids=["noise", "policy", "seed", "no resume", "used folder", "goal", "camera", "no kind", "split of cities"],
+)
+def test_another_data_set_is_refused_in_its_folder(desk: Desk, cosim: Cosim, more: tuple[str, ...], words: str) -> None:
+    """Other settings, a used folder and options that mean nothing are refused in one line, and nothing is touched."""
+    before = sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
+    said = cosim(*ASKED, *more, cwd=desk.folder)
+    assert said.returncode == 2
+    assert words in said.stderr
+    assert "Traceback" not in said.stderr
+    assert before == sorted((path, path.stat().st_mtime_ns) for path in desk.folder.rglob("*"))
+
+
+def test_a_data_set_that_was_stopped_while_it_was_written_is_written_anew(desk: Desk, cosim: Cosim) -> None:
+    """Without meta/ it is not whole: --resume drives nothing again and writes the same bytes."""
+    made = desk.folder / "demos"
+    there = [path for name in ("meta", "data", "videos") for path in (made / name).rglob("*") if path.is_file()]
+    files = {path: path.read_bytes() for path in there}
+    shutil.rmtree(made / "meta")
+    (made / "writing").mkdir()
+    (made / "writing/half").write_bytes(b"")
+    said = cosim(*ASKED, "--resume", cwd=desk.folder)
+    assert said.returncode == 0, said.stderr
+    assert "done, " not in said.stderr
+    assert files == {path: path.read_bytes() for path in files}
+    assert not (made / "writing").exists()
+
+
+def test_fresh_scenarios_are_drawn_the_same_in_pieces() -> None:
+    """Two structures in two small cities: each is drawn under its name and by a light of its own, and who draws them in
+    two pieces gets the same."""
+    from scenarios.collecting.fresh import Fresh
+
+    there = Fresh(kind="unit", structures=("straight", "curve"), seeds=(1, 2), size_m=500.0)
+    drawn = there.drawn(0, 5)
+    assert {one.id for one in drawn} <= {
+        "straight-1-000",
+        "curve-1-000",
+        "straight-2-000",
+        "curve-2-000",
+        "straight-1-001",
+    }
+    assert len({one.light for one in drawn}) == len(drawn) >= 3
+    assert [*there.drawn(0, 2), *there.drawn(2, 3)] == drawn
+
+
+class Sees:
+    """An expert that sees by a camera of its own."""
+
+    manifest = Manifest("sees", camera=CameraSpec(width=32, height=32), goal="final_point")
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.shapes: list[tuple[int, ...]] = []
+
+    def act(self, observation: Observation) -> Command:
+        assert observation.rgb is not None
+        self.shapes.append(observation.rgb.shape)
+        return Command(1.4, 0.0)
+
+
+def test_an_expert_that_sees_keeps_its_own_camera(desk: Desk) -> None:
+    """It is given pictures of its own size, and those of the collecting camera are kept."""
+    expert = Sees()
+    kept = Collecting(camera=CameraSpec(width=64, height=48), rate_hz=4.0, unsolved=True)
+    shown = shown_here(desk.ways[0], Driver.of(expert), kept)
+    assert set(expert.shapes) == {(32, 32, 3)}
+    assert len(expert.shapes) == len(shown) > 5
+    assert shown.colours.sum() == len(shown) * 64 * 48 * 3
+
+
+def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> None:
+    """Its LeRobotDataset has the rows and pictures that are packed. Skipped where lerobot is not installed."""
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset", reason="lerobot is not installed")
+    read = datasets.LeRobotDataset("cosim/demos", root=desk.folder / "demos")
+    assert len(read) == len(packed)
+    for row, one in ((row, read[row]) for row in range(len(read))):
+        np.testing.assert_array_equal(one["action"].numpy(), packed.command[row])
+        picture = 255.0 * one["observation.images.front"].numpy().transpose(1, 2, 0)
+        assert np.abs(picture - packed.frames[row]).mean() < 2.0
