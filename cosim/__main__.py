@@ -6,7 +6,7 @@ import sys
 
 from cosim import machine
 
-NEED_NO_ENGINE = ("list", "show", "score", "compare", "merge", "listen", "inject", "direct")
+NEED_NO_ENGINE = ("list", "show", "score", "compare", "merge", "listen", "inject", "direct", "dataset", "train")
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import fcntl
 import itertools
 import json
 import os
@@ -117,10 +118,10 @@ def chromium() -> Iterator[Page]:
     with tempfile.TemporaryDirectory(prefix="chromium-") as folder:
 
         def wire() -> None:
-            os.dup2(inward, 60)
-            os.dup2(outward, 61)
-            os.dup2(60, 3)
-            os.dup2(61, 4)
+            """To 3 and 4, by numbers that nothing has: either may be one of the two."""
+            ends = [fcntl.fcntl(one, fcntl.F_DUPFD, 10) for one in (inward, outward)]
+            os.dup2(ends[0], 3)
+            os.dup2(ends[1], 4)
 
         command = [CHROMIUM, *_FLAGS, f"--user-data-dir={folder}", "about:blank"]
         log = (Path(folder) / "stderr").open("wb")

@@ -14,22 +14,26 @@ from cosim.cli.network.certs import certs_app
 from cosim.cli.network.direct import direct_app
 from cosim.cli.network.live import live_app
 from cosim.cli.network.serve import serve_app
-from cosim.cli.options.panels import MEASURE, PLACES, STEP_IN
+from cosim.cli.options.panels import LEARN, MEASURE, PLACES, STEP_IN
 from cosim.cli.pictures.export import export_app
 from cosim.cli.pictures.film import film_app
 from cosim.cli.pictures.look import look_app
 from cosim.cli.places.city import city_app
 from cosim.cli.places.map import map_app
+from cosim.cli.policies.check import policy_app
 from cosim.cli.results.compare import compare_app
 from cosim.cli.results.report import report_app
 from cosim.cli.results.score import score_app
 from cosim.cli.results.show import show_app
+from cosim.cli.runs.collect import collect_app
 from cosim.cli.runs.coordinator import coordinator_app
 from cosim.cli.runs.counterfactual import counterfactual_app
+from cosim.cli.runs.dataset import dataset_app
 from cosim.cli.runs.merge import merge_app
 from cosim.cli.runs.replay import replay_app
 from cosim.cli.runs.run import run_app
 from cosim.cli.runs.status import status_app
+from cosim.cli.runs.train import train_app
 from cosim.cli.suites.catalog import list_app
 from cosim.cli.suites.scenario import scenario_app
 from cosim.cli.suites.suite import suite_app
@@ -53,12 +57,14 @@ for commands in (
     *(run_app, list_app, show_app, installation_app),
     *(look_app, film_app, report_app, replay_app, export_app, counterfactual_app),
     *(live_app, direct_app, serve_app, merge_app, coordinator_app, status_app),
-    *(bench_app, score_app, compare_app),
+    *(bench_app, score_app, compare_app, collect_app, train_app),
 ):
     app.add_typer(commands)
 app.add_typer(certs_app, name="certs", rich_help_panel=STEP_IN)
+app.add_typer(dataset_app, name="dataset", rich_help_panel=LEARN)
 app.add_typer(suite_app, name="suite", rich_help_panel=MEASURE)
 app.add_typer(scenario_app, name="scenario", rich_help_panel=MEASURE)
+app.add_typer(policy_app, name="policy", rich_help_panel=MEASURE)
 app.add_typer(city_app, name="city", rich_help_panel=PLACES)
 app.add_typer(map_app, name="map", rich_help_panel=PLACES)
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import signal
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, Literal, Protocol, cast
@@ -77,6 +77,7 @@ class Driver:
         self._begun = ""
         self._answered = False
         self._route: tuple[Polyline, Polyline] | None = None
+        self._hears: Callable[[object], None] | None = None
 
     @property
     def policy(self) -> Policy:
@@ -87,6 +88,11 @@ class Driver:
     def clock(self) -> dict[str, float]:
         """How long the answers of the last episode took, where that is known: for a record's `clock`."""
         return {}
+
+    @property
+    def spent(self) -> bool:
+        """Whether what answers has come to its end: the next episode needs a driver of its own."""
+        return False
 
     def close(self) -> None:
         """Nothing more is asked of the policy."""
@@ -114,9 +120,15 @@ class Driver:
             self._tell_reset(own.episode, own.tick)
         with self._asked("act" if self._answered else "first act", observation.tick):
             answer = self._policy.act(own)
+            if self._hears is not None:
+                self._hears(answer)
             command = command_of(answer, rule=self.manifest.waypoints, robot=own.robot)
         self._answered = True
         return command
+
+    def heard_by(self, hears: Callable[[object], None]) -> None:
+        """Tell somebody every answer as it is, before it is looked at and made a command within the robot's limits."""
+        self._hears = hears
 
     def ended(self) -> None:
         """Tell a policy for many episodes that nothing more is asked about this one, if it has begun. What it raises is

@@ -21,12 +21,16 @@ _OF_THE_CAMERA = ("image", "random_image")
 
 def with_goal(manifest: Manifest, goal: GoalProtocol | None) -> Manifest:
     """A policy's manifest, with the goals of the run if that names some. Raises UsageError, with the valid names, for
-    goals or odometry that there are none of; for pictures as goals, and further cameras, of a policy without a camera.
+    goals or odometry that there are none of; for goals that the policy cannot do with; for pictures as goals, and
+    further cameras, of a policy without a camera.
     """
     settled = manifest if goal is None else replace(manifest, goal=goal)
     goal_called(settled.goal)
     if settled.odometry not in ODOMETRY:
         raise unknown("odometry", settled.odometry, ODOMETRY)
+    if settled.goals and settled.goal not in settled.goals:
+        wanted = " or ".join(settled.goals)
+        raise UsageError(f"policy '{manifest.name}' wants goals {wanted}, and gets '{settled.goal}': choose --goal")
     if settled.cameras and settled.camera is None:
         raise UsageError(f"policy '{manifest.name}' has cameras, but no camera: give its manifest one of them as that")
     if settled.goal in _OF_THE_CAMERA and settled.camera is None:

@@ -206,8 +206,9 @@ class Manifest:
 
     camera: what it sees by, None for a blind one; cameras: further ones, by names of its own; goal: what it is told of
     where to go (`cosim.spec.goal.GOALS`), unless the run says otherwise; odometry: what its sensors tell of where it is
-    (`cosim.spec.odometry.ODOMETRY`); privileged: whether it is told what a camera does not show. Raises nothing itself:
-    an episode refuses what cannot be, such as a rate of which a period is no whole number of ticks.
+    (`cosim.spec.odometry.ODOMETRY`); privileged: whether it is told what a camera does not show; goals: those that it
+    can do with, () for any: a run that gives others is refused. Raises nothing itself: an episode refuses what cannot
+    be, such as a rate of which a period is no whole number of ticks.
 
     >>> Manifest("mine", rate_hz=5.0, camera=CameraSpec(width=512, height=288)).camera.height
     288
@@ -222,6 +223,7 @@ class Manifest:
     goal: GoalProtocol = "none"
     odometry: OdometryKind = "none"
     cameras: Mapping[str, CameraSpec] = filled(default_factory=dict)
+    goals: tuple[GoalProtocol, ...] = ()
 
 
 class Policy(Protocol):

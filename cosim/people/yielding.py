@@ -70,8 +70,7 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
     offset = wanted - body.pose.xy
     if np.hypot(offset[:, 0], offset[:, 1]).min(initial=np.inf) > within_reach_m(body) + _ROUNDING_M:
         return wanted
-    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
-    turn = np.array([[cos, -sin], [sin, cos]])
+    turn = _axes(body)
     everybody = offset @ turn
     rows = np.flatnonzero(_gap(everybody, low, high + reach) < STEP_ROUND_GAP_M)
     if not len(rows):
@@ -109,8 +108,7 @@ def stepped_round(before: Floats, wanted: Floats, body: RobotBody, stand: NDArra
 def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np.bool_]:
     """(N,) who goes from `before` to `after`, (N, 2) metres each, nearer to the robot's outline than one steps round
     it."""
-    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
-    turn, half = np.array([[cos, -sin], [sin, cos]]), np.array(body.half_m)
+    turn, half = _axes(body), np.array(body.half_m)
     gap = _gap((after - body.pose.xy) @ turn, -half, half)
     near: NDArray[np.bool_] = (gap < STEP_ROUND_GAP_M) & (gap < _gap((before - body.pose.xy) @ turn, -half, half))
     return near
@@ -118,10 +116,16 @@ def comes_too_near(before: Floats, after: Floats, body: RobotBody) -> NDArray[np
 
 def touches(xy: Floats, body: RobotBody, within_m: float = TOUCH_M) -> bool:
     """Whether the disk of a person at (2,) metres meets the robot's outline, or comes so near to it."""
-    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
-    local = (np.asarray(xy) - body.pose.xy)[None] @ np.array([[cos, -sin], [sin, cos]])
+    local = (np.asarray(xy) - body.pose.xy)[None] @ _axes(body)
     half = np.array(body.half_m)
     return bool(_gap(local, -half, half)[0] <= within_m)
+
+
+def _axes(body: RobotBody) -> Floats:
+    """(2, 2) ahead and left of the robot, as columns: what an offset from its middle is multiplied by to be told in its
+    frame."""
+    cos, sin = np.cos(body.pose.heading_rad), np.sin(body.pose.heading_rad)
+    return np.array([[cos, -sin], [sin, cos]])
 
 
 def _gap(points: Floats, low: Floats, high: Floats) -> Floats:

@@ -2,9 +2,11 @@
 
 run.json                         what is run: suite, policy, scenarios, versions, renderer
 scenarios.json                   the resolved specs
-episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at all; frames/
+episodes/<scenario>/record.json  and trajectory.npz, written by the run's process, whole or not at all; frames/;
+                                 demonstration.npz where these are collected
 results.sqlite                   one row per finished episode, in the order in which they ended
 results.csv                      the same, sorted by scenario, written at the end
+attempts.jsonl                   scenarios that were begun in vain, a line each time: whoever goes on counts on
 figures.json                     how fast it was, each time that it went on
 logs/                            what the engines of each worker printed
 lock                             held while a run is going on
@@ -17,12 +19,13 @@ import json
 import os
 import shutil
 import sqlite3
+from collections import Counter
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import msgspec
 import pandas as pd
@@ -35,6 +38,8 @@ from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Suite, write_suite
 
 DATABASE = "results.sqlite"
+_ATTEMPTS = "attempts.jsonl"
+DEMONSTRATION = "demonstration.npz"
 REMEDY = "give the command of the run again with --resume, which makes it anew from the records on disk"
 _KEPT = "finished episodes are kept; make room and go on with --resume"
 DAMAGE = {
@@ -42,6 +47,13 @@ DAMAGE = {
 }  # fmt: skip
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
+
+
+class FailedAttempt(NamedTuple):
+    """A scenario that was begun in vain. away: its worker was lost together with its machine, or left."""
+
+    scenario: str
+    away: bool
 
 
 class RunFolder:
@@ -128,13 +140,14 @@ class RunFolder:
         except sqlite3.Error as error:
             raise _trouble(self.path, error) from error
 
-    def keep(self, record: Record, log: bytes = b"") -> None:
+    def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write what came out of an episode, the record last, and add its row. log: the bytes of its `Log`."""
         target = self.episode_folder(record.scenario)
         try:
             target.mkdir(parents=True, exist_ok=True)
-            if log:
-                write_whole(target / "trajectory.npz", log)
+            for name, data in (("trajectory.npz", log), (DEMONSTRATION, demonstration)):
+                if data:
+                    write_whole(target / name, data)
             record.save(target / "record.json")
         except OSError as error:
             raise unwritable(target, error, _KEPT) from error
@@ -148,6 +161,28 @@ class RunFolder:
             (frames / f"{tick:06d}.png").write_bytes(png)
         except OSError as error:
             raise unwritable(frames, error, _KEPT) from error
+
+    def failed_attempts(self) -> Counter[FailedAttempt]:
+        """How often each scenario was begun in vain, since the run began: whoever coordinated it then."""
+        try:
+            lines = (self.path / _ATTEMPTS).read_bytes().splitlines()
+        except FileNotFoundError:
+            return Counter()
+        except OSError as error:
+            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
+        found: Counter[FailedAttempt] = Counter()
+        for line in lines:
+            with suppress(msgspec.DecodeError):  # the last line of a machine that failed
+                found[msgspec.json.decode(line, type=FailedAttempt)] += 1
+        return found
+
+    def keep_failed_attempt(self, attempt: FailedAttempt) -> None:
+        """Write down that a scenario was begun in vain."""
+        try:
+            with (self.path / _ATTEMPTS).open("ab") as file:
+                file.write(msgspec.json.encode(attempt) + b"\n")
+        except OSError as error:
+            raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
 
     def _adopt(self, scenario_id: str) -> bool:
         """Take in the record of a scenario that has no row; False when there is none, or a damaged one."""
@@ -170,8 +205,9 @@ class RunFolder:
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
         try:
-            for name in ("record.json", "trajectory.npz", "record.json.part", "trajectory.npz.part"):
+            for name in ("record.json", "trajectory.npz", DEMONSTRATION):
                 (folder / name).unlink(missing_ok=True)
+                (folder / f"{name}.part").unlink(missing_ok=True)
         except OSError as error:
             raise unwritable(folder, error) from error
 

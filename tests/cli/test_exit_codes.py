@@ -91,7 +91,7 @@ def test_a_run_with_fewer_records_than_scenarios_is_no_success(
 ) -> None:
     """However it came about, the scenarios without a record are named and the exit code is 1."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("scenarios.execution.pool.run_all", lambda *_, **__: None)
+    monkeypatch.setattr("scenarios.execution.suite_run.run_all", lambda *_, **__: None)
     words = ("run", "reactive", "--policy", "orca", "--episodes", "2", "--out", "run")
     assert ended(monkeypatch, *words) == 1
     assert "No record of obstructing-001, conversing-001: run it again with --resume" in capsys.readouterr().err

@@ -16,13 +16,13 @@ import cosim
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = Path(__file__).parents[1] / "examples"
-DRIVES = ("Episode", "run")
+DRIVES = ("Episode", "make_env", "run")
 """Public names whose example drives a robot."""
 PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
 
 
 def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
-    """A new process that imports cosim has loaded no other package, ours included: that is why it takes no time."""
+    """A new process that imports cosim has loaded no other package, and one file of ours: so it takes no time."""
     told = subprocess.run(
         [sys.executable, "-c", "import sys; old = set(sys.modules); import cosim; print(*set(sys.modules) - old)"],
         capture_output=True,
@@ -31,7 +31,7 @@ def test_importing_cosim_imports_nothing_but_the_standard_library() -> None:
         cwd=ROOT,
     ).stdout.split()
     strangers = {name.split(".")[0] for name in told} - set(sys.stdlib_module_names) - {"cosim"}
-    assert not strangers and {n for n in told if n.startswith("cosim")} == {"cosim"}
+    assert not strangers and {n for n in told if n.startswith("cosim")} == {"cosim", "cosim.rounding"}
 
 
 @pytest.mark.parametrize(

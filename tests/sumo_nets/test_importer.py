@@ -45,6 +45,11 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 MAPS = Path(__file__).parents[3] / "shared" / "maps"
 NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
 CAR_ONLY = ("hamburg-tavf", "eichstaett-crowdnav", "braunschweig-bs3d")
+SAMPLE = (
+    "berlin-doerpfeldstr", "berlin-neukoelln", "braunschweig-bs3d", "frederiksted", "london-st-georges", "taipei",
+    "west-oakland",
+)  # fmt: skip
+"""Small maps of each packing, for both sides of the road, with sidewalks and without; --whole imports the others."""
 BERLIN, LONDON = (13.40, 52.50), (-0.12, 51.50)
 
 
@@ -422,8 +427,10 @@ def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
 @pytest.mark.engine
 @pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
 @pytest.mark.parametrize("name", [n for n in NAMES if not n.startswith("zz-")])
-def test_shared_maps_import(name: str) -> None:
+def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
     """Every open map imports with the walkable length that was measured, and can be used."""
+    if name not in SAMPLE and not request.config.getoption("--whole"):
+        pytest.skip("imported with --whole")
     stats = json.loads((MAPS / name / "stats.json").read_text())
     raw = MAPS / name / stats["meta"]["raw"]
     source = raw if raw.exists() else MAPS / name / stats["meta"]["net"]

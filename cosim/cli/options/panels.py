@@ -3,5 +3,6 @@
 from __future__ import annotations
 
 LOOK, STEP_IN, MEASURE, PLACES = "Look at episodes", "Step into running episodes", "Measure", "Places"
+LEARN = "Learn from demonstrations"
 TRUST = "Trust what came out"
 MANY = "Many machines"

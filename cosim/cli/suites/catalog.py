@@ -34,6 +34,9 @@ def list_all(
 def print_names(out: Console) -> None:
     """Suites, robots and their cameras, policies, goals: a line for each."""
     from cosim.policies import POLICIES
+    from cosim.policies.follow.networks import weights_in_words
+    from cosim.policies.follow.policy import Follow
+    from cosim.policies.shipped import bundle_in_words, shipped_bundles
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
     from scenarios.catalog import SUITES, load_suite
@@ -48,6 +51,10 @@ def print_names(out: Console) -> None:
             out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
     for name, make in POLICIES.items():
         out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+    for name, folder in shipped_bundles().items():
+        out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
+    about = (Follow.__doc__ or "").splitlines()[0]
+    out.print(f"policy  {Follow.manifest.name}  {about} {weights_in_words()}", soft_wrap=True)
     for name, words in GOALS.items():
         out.print(f"goal    {name}  {words}", soft_wrap=True)
 

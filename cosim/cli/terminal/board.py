@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence, Set
+from math import fsum
 from typing import TYPE_CHECKING
 
 from rich.console import Console
@@ -41,8 +42,8 @@ class Left:
         """What of the run is done, 0 to 1."""
         if not self._lengths_m:
             return 1.0
-        done_m = sum(SETUP_M + self._lengths_m[name] * share for name, share in self._shares.items())
-        return done_m / sum(SETUP_M + length_m for length_m in self._lengths_m.values())
+        done_m = fsum(SETUP_M + self._lengths_m[name] * share for name, share in self._shares.items())
+        return done_m / fsum(SETUP_M + length_m for length_m in self._lengths_m.values())
 
     def seconds(self, since_s: float) -> float | None:
         """How long the rest takes, judged by the `since_s` seconds that the run took so far; None: too early to say."""
@@ -120,4 +121,4 @@ class Board:
     def _rest(self) -> str:
         """How long the rest takes, in words; nothing while that is not known, and nothing at the end."""
         rest_s = self.left.seconds(self._clock() - self._began_s)
-        return "" if not rest_s else f"about {duration(rest_s)} left"
+        return "" if rest_s is None or rest_s < 0.5 else f"about {duration(rest_s)} left"

@@ -38,6 +38,16 @@ def test_what_is_left_is_judged_by_the_way_not_by_the_count() -> None:
     assert left.seconds(200.0) == 0.0
 
 
+def test_nothing_is_left_of_a_run_that_is_done() -> None:
+    """However the lengths of its ways are rounded as they are added up: never less than nothing."""
+    lengths_m = {str(i): 0.1 + i / 3.0 for i in range(200)}
+    for order in (list(lengths_m), list(reversed(lengths_m)), sorted(lengths_m)):
+        left = Left(lengths_m)
+        for name in order:
+            left.at(name, 1.0)
+        assert left.share == 1.0 and left.seconds(1e6) == 0.0
+
+
 def board_of(scenarios: tuple, done: tuple[str, ...] = (), **options: object) -> tuple[Board, Clock, io.StringIO]:
     clock, said = Clock(), io.StringIO()
     console = Console(file=said, width=80)
