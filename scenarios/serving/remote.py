@@ -114,18 +114,20 @@ class PolicyServers:
         session, info, _ = self._server
         kind = str(question.__struct_config__.tag)
         key, payload = f"{policy_key(DOMAIN, self.name, info.server)}/{kind}", encode_asked(question)
-        heard_s = time.monotonic()
+        unheard_since_s = None  # a question that was under way for long says nothing against the server
         to_end = kind == "ended"
         while True:
             heard = session.ask_once(key, payload, timeout_s=_TOLD_WITHIN_S if to_end else _TRY_S)
             if heard.how in ("answered", "refused"):
                 return self._read(heard.payload, question)
             if heard.how == "late" and not to_end:
-                heard_s = time.monotonic()
-            elif to_end or self._server.replaced or time.monotonic() - heard_s > _LOST_AFTER_S:
+                unheard_since_s = None
+                continue
+            now_s = time.monotonic()
+            unheard_since_s = now_s if unheard_since_s is None else unheard_since_s
+            if to_end or self._server.replaced or now_s - unheard_since_s > _LOST_AFTER_S:
                 raise PolicyServerLost(f"the server {info.server} of policy '{self.name}' is gone")
-            else:
-                time.sleep(_PAUSE_S)
+            time.sleep(_PAUSE_S)
 
     def close(self) -> None:
         for session in self._sessions.values():

@@ -31,7 +31,7 @@ from bridge.policy_server import (
     policy_key,
     serve,
 )
-from bridge.session import Session, open_session
+from bridge.session import QueryHeard, Session, open_session
 from cosim.core.errors import MachineError, PolicyError, PolicyServerLost, UsageError
 from cosim.core.state import Command
 from cosim.episode.given import calibration_of
@@ -197,6 +197,27 @@ def test_a_step_that_is_asked_again_is_answered_from_what_was_kept(
         driver.reset("slow", 7)
         assert [driver.act(seen_at(tick, "slow")) for tick in (0, 5)] == [Command(0.1, 0.0), Command(0.2, 0.0)]
     assert policy.asked == ["slow", "slow"]
+
+
+@pytest.mark.engine
+def test_a_link_cut_while_a_question_is_under_way_for_long_is_waited_for(
+    hub: Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A server is gone when nobody has heard of it for a while after the link was cut, however long it had thought."""
+    monkeypatch.setattr(remote, "_LOST_AFTER_S", 0.3)
+    ask_once, cuts = Session.ask_once, ["one"]
+
+    def cut_once(session: Session, key: str, payload: bytes, *, timeout_s: float) -> QueryHeard:
+        if not cuts:
+            return ask_once(session, key, payload, timeout_s=timeout_s)
+        cuts.clear()
+        time.sleep(0.6)
+        return QueryHeard("nobody")
+
+    with served(hub, Counting()), driver_at(hub) as driver:
+        driver.reset("k1", 7)
+        monkeypatch.setattr(Session, "ask_once", cut_once)
+        assert driver.act(seen_at(0)) == Command(0.1, 0.0)
 
 
 @pytest.mark.engine
