@@ -33,7 +33,7 @@ from cosim.learning.network import (
 HELD_OUT: Final = 0.1
 """Of the episodes."""
 STOPS_MPS: Final = 0.3
-"""Who is told to drive slower than this is told to stop."""
+"""Who is told to drive slower than this is told to stop, and who drives slower stands."""
 _DARK, _BRIGHT = 0.6, 1.5
 _TINT: Final = 0.12
 _SHAKEN_PX: Final = 3
@@ -44,7 +44,6 @@ that it is slow takes that for the reason to stop, and does not where it comes f
 _CHANGES: Final = 0.3
 """Of a batch such a share is of rows in which the expert stops while the robot drives, or drives off while it stands.
 They are one in fifty of what was driven, and who is asked for the others alone goes on as it is going."""
-_DRIVES_MPS: Final = 0.3
 _ROUNDING: Final = 1e-4
 _ALIKE: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
 
@@ -105,9 +104,9 @@ class Examples:
         self._command = joined([one.command for one in packed])
         self._way = joined([one.waypoints[:, :WAYPOINTS] for one in packed])
         self._driven = joined([one.driven for one in packed])
-        command, speed = (np.concatenate([getattr(one, name)[:, 0] for one in packed]) for name in ("command", "state"))
-        changes = (command < STOPS_MPS) != (speed < _DRIVES_MPS)
-        self._changes = self.learned[changes[self.learned]] if changes[self.learned].any() else self.learned
+        changes = np.concatenate([(one.command[:, 0] < STOPS_MPS) != (one.state[:, 0] < STOPS_MPS) for one in packed])
+        found = self.learned[changes[self.learned]]
+        self._changes = found if len(found) else self.learned
         self._device = device
 
     def drawn(self, seed: int, step: int, size: int) -> Batch:

@@ -26,7 +26,8 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
     """What is kept. camera: of the pictures; rate_hz: how often the expert is asked and a picture is taken, a whole
     number of times a second. waypoints, waypoint_s: how many places ahead, and the time from one to the next, whole
     ticks of 0.05 s. noise: the share of the time in which another command than the expert's is driven, in bursts.
-    unsolved: episodes that the expert does not solve are kept, too, up to where the robot is put elsewhere.
+    learner: the policy whose commands these are, "" for the expert's own, slowed and turned aside by chance. unsolved:
+    episodes that the expert does not solve are kept, too, up to where the robot is put elsewhere.
     Raises SpecError."""
 
     camera: CameraSpec = CameraSpec(width=160, height=90)
@@ -34,6 +35,7 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
     waypoints: int = 8
     waypoint_s: float = 0.2
     noise: float = 0.0
+    learner: str = ""
     unsolved: bool = False
 
     def __post_init__(self) -> None:
@@ -42,6 +44,8 @@ class Collecting(msgspec.Struct, frozen=True, kw_only=True):
             raise SpecError(f"a data set has {told} pictures a second, not {self.rate_hz:g}: choose one of these rates")
         if not 0.0 <= self.noise <= _MOST_NOISE:
             raise SpecError(f"noise must be in [0, {_MOST_NOISE:g}], a share of the time, not {self.noise:g}")
+        if self.learner and not self.noise:
+            raise SpecError(f"learner '{self.learner}' drives in the share of the time that is noise: give --noise 0.6")
         if not 1 <= self.waypoints <= _MOST_WAYPOINTS:
             raise SpecError(f"waypoints must be in [1, {_MOST_WAYPOINTS}], not {self.waypoints}")
         if not (math.isfinite(self.waypoint_s) and 0.0 < self.waypoint_s <= 10.0 and _ticks(self.waypoint_s)):
@@ -58,6 +62,22 @@ def _ticks(time_s: float) -> int:
     """How many ticks a time is; 0 if it is no whole number of them."""
     ticks = Clock().ticks(time_s)
     return ticks if math.isclose(ticks * Clock().tick_s, time_s) else 0
+
+
+def check_learner(learner: Manifest, collecting: Collecting, expert: Manifest, goal: GoalProtocol) -> None:
+    """Raises UsageError where a learner would be given something else than what is collected. goal: of the rows."""
+    if expert.camera is not None:
+        raise UsageError(
+            f"expert '{expert.name}' sees by a camera of its own, and a learner drives beside one that does not"
+        )
+    camera = learner.camera
+    if camera is None or learner.privileged or learner.cameras or learner.odometry != "none":
+        raise UsageError(f"learner '{learner.name}' is no policy that drives by one camera, speeds and a goal alone")
+    if (camera, learner.rate_hz, learner.goal) != (collecting.camera, collecting.rate_hz, goal):
+        raise UsageError(
+            f"learner '{learner.name}' is to see what is collected: give --camera {camera.width}x{camera.height} --fov "
+            f"{camera.fov_deg:g} --mount {camera.mount} --rate {learner.rate_hz:g} --goal {learner.goal}"
+        )
 
 
 def demonstrating(expert: Manifest, collecting: Collecting, goal: GoalProtocol | None = None) -> Manifest:

@@ -62,6 +62,7 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     episodes: int
     policy: str
     policy_source: str
+    learner_source: str = ""
     robot: str = ""
     goal: str
     seed: int
@@ -195,6 +196,7 @@ class _Rounds:
             episodes=episodes if is_fresh else min(episodes, len(self.all)),
             policy=self.policy,
             policy_source=expert.source_hash,
+            learner_source="" if (learner := self.demonstrator.learner) is None else learner.source_hash,
             robot=self.options.robot,
             goal=self.demonstrator.manifest.goal,
             seed=self.options.seed or 0,
@@ -317,6 +319,8 @@ def _written(
         "policy": demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,
+        "learner": spec.collecting.learner,
+        "learner_source": spec.learner_source,
         "suite": spec.suite,
         "seed": spec.seed,
         "renderer": spec.renderer,

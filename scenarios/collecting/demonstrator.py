@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -15,8 +17,9 @@ from cosim.episode.driver import Driver
 from cosim.episode.given import with_goal
 from cosim.episode.log import Log
 from cosim.episode.ports import Observation
+from cosim.policies.load import load_policy
 from cosim.records.record import Record
-from cosim.spec.collecting import EYE, Collecting, demonstrating
+from cosim.spec.collecting import EYE, Collecting, check_learner, demonstrating
 from cosim.spec.goal import GoalProtocol, Instruction, PointGoal
 from cosim.spec.robot import Robot
 from cosim.spec.scenario import Scenario
@@ -25,13 +28,16 @@ from scenarios.collecting.demonstration import Demonstration, glimpse, waypoints
 
 _BURST_S: Final = (0.4, 1.0)
 """So long another command is driven, least and most."""
+_LEARNER_S: Final = (1.0, 5.0)
+"""So long a learner drives: until it comes where it errs, and stays there for a while."""
 _SLOWER: Final = (0.5, 1.2)
 """By this the expert's speed is multiplied, and to its turning is added at most so much of the robot's fastest."""
 _TURN: Final = 0.8
 
 
 class Demonstrator(Driver):
-    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. Raises UsageError."""
+    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. A learner that drives is asked
+    at every picture, so that it knows those before (Ross et al., DAgger, 2011). Raises UsageError."""
 
     def __init__(self, expert: Driver, collecting: Collecting, goal: GoalProtocol | None = None) -> None:
         manifest = with_goal(demonstrating(expert.manifest, collecting, goal), None)
@@ -41,6 +47,9 @@ class Demonstrator(Driver):
         self._sees = expert.manifest.camera is not None
         self._rows = _Rows(manifest.rate_hz)
         self._bursts = _Bursts(0, collecting)
+        self.learner = _learner(collecting.learner) if collecting.learner else None
+        if self.learner is not None:
+            check_learner(self.learner.manifest, collecting, expert.manifest, manifest.goal)
 
     @property
     def clock(self) -> dict[str, float]:
@@ -52,18 +61,23 @@ class Demonstrator(Driver):
     def reset(self, episode_id: str, seed: int) -> None:
         self._rows, self._bursts = _Rows(self.manifest.rate_hz), _Bursts(seed, self._collecting)
         self._expert.reset(episode_id, seed)
+        if self.learner is not None:
+            self.learner.reset(episode_id, seed)
 
     def act(self, observation: Observation) -> Command:
-        """What is driven: the expert's command, or in a burst another one."""
+        """What is driven: the expert's command, or in a burst another one, or the learner's."""
         rgb = observation.pictures[EYE].rgb if self._sees else observation.rgb
         assert rgb is not None
         answer = self._expert.act(observation)
-        driven = self._bursts.driven(answer, observation.robot)
+        learned = None if self.learner is None else self.learner.act(replace(observation, privileged=None))
+        driven = self._bursts.driven(answer, observation.robot, learned)
         self._rows.add(observation, rgb, answer, driven is not answer)
         return driven
 
     def ended(self) -> None:
         self._expert.ended()
+        if self.learner is not None:
+            self.learner.ended()
 
     def kept(self, scenario: Scenario, record: Record, log: Log | None) -> bytes:
         """The demonstration, encoded; nothing where there is none: the episode crashed, or was not solved."""
@@ -77,30 +91,40 @@ def solved(record: Record, log: Log) -> bool:
     return record.status == "done" and record.measures["success"] == 1.0 and bool(np.isnan(log.reset_s_m).all())
 
 
+@cache
+def _learner(name: str) -> Driver:
+    """One for all episodes of a process."""
+    return load_policy(name)
+
+
 class _Bursts:
     """When another command is driven, and which: drawn from the episode's seed alone."""
 
     def __init__(self, seed: int, collecting: Collecting) -> None:
         self._draws = np.random.default_rng([seed, 0xDA66E5])
         self._period_s, self._share = 1.0 / collecting.rate_hz, collecting.noise
+        self._lasts_s = _LEARNER_S if collecting.learner else _BURST_S
         self._left = self._calm = 0
         if float(self._draws.random()) >= self._share:  # else it begins with a burst
             self._calm = self._steps_of_calm()
         self._slower = self._turn = 0.0
 
-    def driven(self, answer: Command, robot: Robot) -> Command:
-        """What is driven where the expert answers this; the answer itself outside of bursts."""
+    def driven(self, answer: Command, robot: Robot, learned: Command | None = None) -> Command:
+        """What is driven where the expert answers this, and the learner, if there is one, that; the answer itself
+        outside of bursts."""
         if not self._share:
             return answer
         if not self._left and self._calm:
             self._calm -= 1
             return answer
         if not self._left:
-            self._left = max(1, round(float(self._draws.uniform(*_BURST_S)) / self._period_s))
+            self._left = max(1, round(float(self._draws.uniform(*self._lasts_s)) / self._period_s))
             self._calm = self._steps_of_calm()
             self._slower = float(self._draws.uniform(*_SLOWER))
             self._turn = float(self._draws.uniform(-_TURN, _TURN))
         self._left -= 1
+        if learned is not None:
+            return learned
         turned_radps = answer.w_radps + self._turn * robot.w_max_radps
         return clipped(Command(self._slower * answer.v_mps, turned_radps), robot)
 
@@ -108,7 +132,7 @@ class _Bursts:
         """How many answers are driven as they are before the next burst, so that bursts have their share."""
         if not self._share:
             return 0
-        mean_s = float(np.mean(_BURST_S)) * (1.0 - self._share) / self._share
+        mean_s = float(np.mean(self._lasts_s)) * (1.0 - self._share) / self._share
         return round(float(self._draws.exponential(mean_s)) / self._period_s)
 
 

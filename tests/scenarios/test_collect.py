@@ -7,12 +7,13 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import msgspec
 import numpy as np
 import pytest
 
+from cosim.core.errors import SpecError, UsageError
 from cosim.core.packed import Packed, read_packed
 from cosim.core.state import Command
 from cosim.episode.driver import Driver
@@ -200,6 +201,62 @@ def test_an_expert_that_sees_keeps_its_own_camera(desk: Desk) -> None:
     assert set(expert.shapes) == {(32, 32, 3)}
     assert len(expert.shapes) == len(shown) > 5
     assert shown.colours.sum() == len(shown) * 64 * 48 * 3
+
+
+class Stands:
+    """An expert that never drives."""
+
+    manifest = Manifest("stands", camera=None, goal="route_point")
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        """Nothing to forget."""
+
+    def act(self, observation: Observation) -> Command:
+        return Command(0.0, 0.0)
+
+
+class Learner(Stands):
+    """Drives on, and knows nothing that a picture does not show. asked: the ticks of an episode."""
+
+    manifest = Manifest("learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point")
+    asked: ClassVar[list[int]] = []
+
+    def act(self, observation: Observation) -> Command:
+        assert observation.privileged is None
+        assert observation.rgb is not None and observation.rgb.shape == (48, 64, 3)
+        self.asked.append(observation.tick)
+        return Command(0.7, 0.1)
+
+
+def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Desk) -> None:
+    """It is asked at every picture, drives its share of the time, seconds at once, while each row has the expert's
+    answer; the same seed gives the same bytes."""
+    camera = CameraSpec(width=64, height=48)
+    called = f"{__name__}:Learner"
+    kept = Collecting(camera=camera, noise=0.6, learner=called, unsolved=True)
+    way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
+    shown = shown_here(way, Driver.of(Stands()), kept)
+    learner = sys.modules[__name__].Learner
+    assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
+    assert not shown.command.any()
+    assert 0.3 < shown.disturbed.mean() < 0.9
+    begins = np.flatnonzero(shown.disturbed[1:] & ~shown.disturbed[:-1])
+    assert begins.size and shown.disturbed.sum() / (begins.size + 1) >= 5
+    assert shown.state[1:, 0][shown.disturbed[:-1]].mean() > 0.4 > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
+    assert shown_here(way, Driver.of(Stands()), kept).encoded() == shown.encoded()
+
+
+def test_a_learner_that_would_see_something_else_is_refused() -> None:
+    """With what to give; so is one beside an expert that sees by a camera of its own, and one that is blind."""
+    asked = Collecting(camera=CameraSpec(width=80, height=60), noise=0.6, learner=f"{__name__}:Learner")
+    with pytest.raises(UsageError, match="give --camera 64x48 --fov 75 --mount front --rate 5 --goal route_point"):
+        Demonstrator(Driver.of(Stands()), asked)
+    with pytest.raises(UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"):
+        Demonstrator(Driver.of(Stands()), msgspec.structs.replace(asked, learner=f"{__name__}:Stands"))
+    with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):
+        Demonstrator(Driver.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0))
+    with pytest.raises(SpecError, match="give --noise"):
+        msgspec.structs.replace(asked, noise=0.0)
 
 
 def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> None:

@@ -35,6 +35,10 @@ _EPISODES_HELP = "So many demonstrations are kept; of a suite all that are solve
 _NOISE_HELP = (
     "Share of the time in which another command is driven, in bursts; the expert's answer is kept all the same."
 )
+_LEARNER_HELP = (
+    "DAgger: this policy drives in --noise's share of the time, 1 to 5 s at once, and the expert's answer is kept. It "
+    "sees the pictures that are collected."
+)
 _RATE_HELP = "Pictures and answers a second: 1, 2, 4, 5, 10 or 20; of an expert that sees its own rate."
 _UNSOLVED_HELP = "Keep also what the expert does not solve, up to where the robot is put back."
 
@@ -46,6 +50,7 @@ _UNSOLVED_HELP = "Keep also what the expert does not solve, up to where the robo
     "`cosim collect reactive --cities 900:940 --event gesturing --episodes 500 --jobs 2 --out demos/gesturing`  \n"
     "`cosim collect unit --cities 900:980 --episodes 1000 --noise 0.2 --out demos/unit`  \n"
     "`cosim collect reactive --split val --policy my_robot.policy:Mine --camera 96x96 --rate 4 --out demos/val`  \n"
+    "`cosim collect reactive --cities 900:940 --fov 60 --noise 0.7 --learner small --unsolved --out demos/again`  \n"
     "`cosim collect ... --out demos/unit --resume`, where it was stopped; then `cosim dataset pack`",
 )
 def collect_command(
@@ -72,6 +77,7 @@ def collect_command(
     waypoints: Annotated[int, typer.Option(help="So many places ahead are taken from the trajectory.")] = 8,
     waypoint_s: Annotated[float, typer.Option("--waypoint-s", help="Seconds from one of them to the next.")] = 0.2,
     noise: Annotated[float, typer.Option(help=_NOISE_HELP)] = 0.0,
+    learner: Annotated[str, typer.Option(metavar="POLICY", help=_LEARNER_HELP)] = "",
     unsolved: Annotated[bool, typer.Option("--unsolved", help=_UNSOLVED_HELP)] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of the policy, of noise, and with --map of the scenarios.")] = 0,
     renderer: Annotated[Choice, typer.Option("--renderer", metavar="CAMERA", help=CAMERA_HELP)] = "auto",
@@ -96,8 +102,9 @@ def collect_command(
     wide, high = size_called("--camera", size)
     spec = CameraSpec(width=wide, height=high, fov_deg=fov, mount=mount)
     collecting = Collecting(
-        camera=spec, rate_hz=rate, waypoints=waypoints, waypoint_s=waypoint_s, noise=noise, unsolved=unsolved
-    )
+        camera=spec, rate_hz=rate, waypoints=waypoints, waypoint_s=waypoint_s, noise=noise, learner=learner,
+        unsolved=unsolved,
+    )  # fmt: skip
     expert = known_driver(policy, PolicyHost(), jobs)
     options = EpisodeOptions(
         seed=seed, robot=robot, goal=goal_called(goal), own_camera=own_camera, camera=camera_here(renderer)
