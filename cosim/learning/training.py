@@ -28,9 +28,11 @@ from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, n
 CHECKPOINT: Final = "checkpoint.pt"
 CURVE: Final = "curve.csv"
 _KEPT_EVERY_S: Final = 60.0
-_LOOKED_EVERY: Final = 20
-"""So often in a training the held-out episodes are looked at."""
-_MOST_HELD_OUT: Final = 8192
+_LOOKS: Final = 20
+"""So often in a training the held-out episodes are looked at, at least so many steps apart: a look takes as long as
+thirty steps or more."""
+_STEPS_APART: Final = 200
+_MOST_HELD_OUT: Final = 4096
 _AVERAGED: Final = 0.999
 """What is shipped are the parameters' moving averages, of so much of the step before."""
 _WARM_UP: Final = 0.03
@@ -62,6 +64,15 @@ class Training:
         for field in ("steps", "batch", "rate", "minutes"):
             if not getattr(self, field) > 0:
                 raise UsageError(f"--{field} must be above 0, not {getattr(self, field):g}")
+
+    @property
+    def look_every(self) -> int:
+        """So many steps are from one look at the held-out episodes to the next."""
+        return max(self.steps // _LOOKS, _STEPS_APART)
+
+    def looks_after(self, step: int) -> bool:
+        """Whether the held-out episodes are looked at when so many steps are done."""
+        return step % self.look_every == 0 or step == self.steps
 
     @property
     def spec(self) -> dict[str, Any]:
@@ -108,11 +119,10 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
     spec = training.spec | {"rows": len(examples.learned), "held_out": len(examples.held_out)}
     state = _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
     saved_s = time.monotonic()
-    look_every = max(1, training.steps // _LOOKED_EVERY)
     while state.step < training.steps:
         lost = _stepped(state, examples, training)
         state.step += 1
-        if state.step % look_every == 0 or state.step == training.steps:
+        if training.looks_after(state.step):
             row = {"step": float(state.step), **lost, **_errors(state.averaged, examples)}
             if not math.isfinite(sum(row.values())):
                 raise RunError(
@@ -171,7 +181,7 @@ def _stepped(state: _State, examples: Examples, training: Training) -> dict[str,
         torch._foreach_lerp_(
             list(state.averaged.values()), [one.detach() for one in state.parameters.values()], 1.0 - kept
         )
-    if (step + 1) % max(1, training.steps // _LOOKED_EVERY) and step + 1 < training.steps:
+    if not training.looks_after(step + 1):
         return {}
     return {f"{name}_loss": float(part.detach()) for name, part in parts.items()}
 

@@ -1,13 +1,14 @@
 #!/usr/bin/env bash
 # From nothing to the table of a small policy: demonstrations, training, fine-tuning with three seeds, scores, comparison.
+# Each event is collected three times: driven by the expert, and twice by what was learned so far (`collect --learner`).
 #
 #   scenarios/examples/small_policy.sh WORK
 #
 # Works in pieces: stops after MINUTES (9 by default) and goes on where it was when called again, until it says "all done".
 # JOBS: processes that simulate (16). COSIM: the command (cosim). PYTHON: the one that has PyTorch, onnx and numpy, any from
 # 3.11 on (python3); it needs nothing else of this project but its folder. Made for 16 cores and a GPU; on two cores set
-# OMP_NUM_THREADS=1 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500), and fewer steps by
-# STEPS (16000) and MORE (8000, of the fine-tuning). EVENTS: which are learned (all eight). MALLOC_...: memory of a step is
+# OMP_NUM_THREADS=1 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500, AGAIN: 200 a
+# round), and fewer steps by STEPS (16000) and MORE (8000, of the fine-tuning). EVENTS: which are learned (all eight). MALLOC_...: memory of a step is
 # kept for the next one; giving it back and taking it again was a third of the time.
 set -uo pipefail
 here=$(cd "$(dirname "$0")/../.." && pwd)
@@ -34,23 +35,36 @@ learn() { # name, words...
 }
 collect() { # name, words...
   local name=$1; shift
-  step "collect-$name" $COSIM collect "$@" --cities 900:940 --noise 0.2 --fov 60 --jobs "$JOBS" --out "$W/demos/$name" --resume
+  step "collect-$name" $COSIM collect "$@" --fov 60 --jobs "$JOBS" --out "$W/demos/$name" --resume
+}
+collect_again() { # round, learner, cities: what the expert would have done where the learner drives
+  for event in $EVENTS; do
+    collect "$1/$event" reactive --event "$event" --episodes "${AGAIN:-200}" --cities "$3" --noise 0.7 --learner "$2" --unsolved
+  done
+  step "pack-$1" $COSIM dataset pack "$W/demos/$1"/* -o "$W/$1.npz"
+}
+finetune() { # name, seed, data...
+  local name=$1 seed=$2; shift 2
+  learn "$name" "$@" "$W/unit.npz" --from "$W/nets/small" --seed "$seed" --steps "${MORE:-8000}" --rate 3e-4 --name small-reactive
 }
 score() { # name, policy, suite
   local more=(); [ -e "$W/runs/$3-$1/run.json" ] && more=(--resume)
   step "run-$3-$1" $COSIM run "$3" --split test --seed 1 --jobs "$JOBS" --policy "$2" --out "$W/runs/$3-$1" "${more[@]}"
 }
 
-collect unit unit --episodes "${UNIT:-1500}"
+drawn=(--cities 900:940 --noise 0.2)
+collect unit unit --episodes "${UNIT:-1500}" "${drawn[@]}"
 for event in $EVENTS; do
-  collect "events/$event" reactive --event "$event" --episodes "${EACH:-500}"
+  collect "events/$event" reactive --event "$event" --episodes "${EACH:-500}" "${drawn[@]}"
 done
 step pack-unit $COSIM dataset pack "$W/demos/unit" -o "$W/unit.npz"
 step pack-events $COSIM dataset pack "$W"/demos/events/* -o "$W/events.npz"
 learn small "$W/unit.npz" --steps "${STEPS:-16000}"
+collect_again round1 "onnx:$W/nets/small" 940:980
+finetune halfway 0 "$W/events.npz" "$W/round1.npz"
+collect_again round2 "onnx:$W/nets/halfway" 980:1020
 for seed in 0 1 2; do
-  learn small-reactive-$seed "$W/events.npz" "$W/unit.npz" --from "$W/nets/small" --seed $seed --steps "${MORE:-8000}" \
-    --rate 3e-4 --name small-reactive
+  finetune small-reactive-$seed $seed "$W/events.npz" "$W/round1.npz" "$W/round2.npz"
 done
 for suite in unit reactive long-horizon; do
   for net in small small-reactive-0 small-reactive-1 small-reactive-2; do score $net "onnx:$W/nets/$net" $suite; done
