@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import statistics
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -22,6 +23,7 @@ _FILE = "figures.json"
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
     """Of one go of a run. began: UTC; simulated_s: of all episodes; setup_s, driving_s: seconds of its processes, until
     the first observation and from there on; retried: episodes that were begun again; given_up: after the last attempt.
+    answer_ms: what the policy took for an answer, the median of the episodes' medians; None where that is not known.
     """
 
     began: str
@@ -34,6 +36,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
     driving_s: float
     retried: int
     given_up: int
+    answer_ms: float | None = None
 
     @property
     def in_words(self) -> str:
@@ -44,6 +47,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
             f"{self.episodes} episodes in {self.wall_s:.0f} s: {self.episodes_per_hour:,.0f} an hour, "
             f"{self.times_real:.1f} x real time; processes were busy for {busy_s:.0f} s{setup}; "
             f"{self.retried} retried, {self.given_up} given up"
+            + ("" if self.answer_ms is None else f"; the median answer took {self.answer_ms:.3g} ms")
         )
 
 
@@ -81,7 +85,14 @@ def _figures_of(records: Collection[Record], began: str, wall_s: float, counts: 
         driving_s=sum(record.clock.get("wall_s", 0.0) for record in records) - setup_s,
         retried=counts.get("retried", 0),
         given_up=counts.get("given up", 0),
+        answer_ms=median_answer_ms(records),
     )
+
+
+def median_answer_ms(records: Iterable[Record]) -> float | None:
+    """What the policy took for an answer, the median of the episodes' medians; None where none tells."""
+    told = [record.clock["answer_ms"] for record in records if "answer_ms" in record.clock]
+    return statistics.median(told) if told else None
 
 
 def keep_figures(folder: Path, figures: Figures) -> None:

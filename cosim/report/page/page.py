@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 
 from cosim.core.telling import duration
+from cosim.records.figures import median_answer_ms
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
@@ -214,6 +215,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     spec = run.spec
     walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
     wall = f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode" if walls else "not told"
+    took_ms = median_answer_ms(run.records)
     return {
         "policy": f"{spec.policy_name} {spec.policy_version} ({spec.policy})",
         "its source": spec.policy_source or "not told",
@@ -224,6 +226,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "drawn by": spec.renderer,
         "goal": spec.goal_protocol,
         "odometry": spec.odometry,
+        "an answer took": "not told" if took_ms is None else f"{took_ms:.3g} ms, the median",
         "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
         "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
         "waypoints": spec.waypoints.in_words,

@@ -12,7 +12,7 @@ import pytest
 from cosim.cli.terminal.logs import logged
 from cosim.core.errors import MachineError, UsageError
 from cosim.core.journal import happened
-from cosim.records.figures import Going, keep_figures
+from cosim.records.figures import Figures, Going, keep_figures, median_answer_ms
 from cosim.records.run_folder import read_records
 from tests.records.driven_runs import run_of
 
@@ -57,3 +57,17 @@ def test_figures_of_a_run_are_kept_for_each_time_that_it_went_on(tmp_path: Path)
     assert (first["episodes"], first["retried"], first["given_up"]) == (2, 1, 0)
     assert first["simulated_s"] == pytest.approx(simulated_s) and second["wall_s"] == 10.0
     assert "2 episodes in" in go.figures.in_words and "1 retried, 0 given up" in go.figures.in_words
+    assert first["answer_ms"] is None and "answer" not in go.figures.in_words
+
+
+def test_what_the_policy_took_for_an_answer_is_told(tmp_path: Path) -> None:
+    """The median of the episodes' medians, of those that tell."""
+    some = read_records(run_of(tmp_path / "run", ["goal", "hit", "goal", "hit"]))
+    clocks = [{"answer_ms": ms} if ms else {} for ms in (2.0, 0.0, 30.0, 4.0)]
+    took = [msgspec.structs.replace(record, clock=clock) for record, clock in zip(some, clocks, strict=True)]
+    assert median_answer_ms(took) == 4.0 and median_answer_ms(took[1:2]) is None
+    figures = Figures(
+        began="", wall_s=1.0, episodes=4, simulated_s=1.0, episodes_per_hour=1.0, times_real=1.0, setup_s=0.0,
+        driving_s=1.0, retried=0, given_up=0, answer_ms=4.123,
+    )  # fmt: skip
+    assert figures.in_words.endswith("; the median answer took 4.12 ms")
