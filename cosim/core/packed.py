@@ -38,8 +38,8 @@ class Packed:
     """Demonstrations in memory; the arrays are those of the file.
 
     meta: rate_hz, waypoint_s; goal, the name of its protocol, "none" without one; camera, as in `CameraSpec`; robot;
-    policy and noise, lists with those of each data set; structures, a list with what each episode is an example of
-    ("straight", "gesturing"), and scenarios, a list of their ids.
+    policy, noise and learner, lists with those of each data set; structures, a list with what each episode is an
+    example of ("straight", "gesturing"), and scenarios, a list of their ids.
     """
 
     frames: NDArray[np.uint8]

@@ -61,14 +61,15 @@ def _facts(data: bytes) -> dict[str, Any]:
 
 def manifest_of(name: str, meta: dict[str, Any], seed: int) -> dict[str, Any]:
     """What the graph wants and answers, by what the demonstrations say of themselves."""
-    experts = ", ".join(dict.fromkeys(meta["policy"]))
+    experts, learners = (", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner"))
+    taught = f", and would have done where {learners} drove" if learners else ""
     camera = {field: meta["camera"].get(field) for field in ("width", "height", "fov_deg", "mount", "crop")}
     return {
         "format": 1,
         "name": name,
         "version": "1",
         "licence": "Apache-2.0",
-        "source": f"cosim train, seed {seed}, on what {experts} drove",
+        "source": f"cosim train, seed {seed}, on what {experts} drove{taught}",
         "rate_hz": meta["rate_hz"],
         "goal": meta["goal"],
         "camera": camera,

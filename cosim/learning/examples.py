@@ -45,6 +45,7 @@ _CHANGES: Final = 0.3
 """Of a batch such a share is of rows in which the expert stops while the robot drives, or drives off while it stands.
 They are one in fifty of what was driven, and who is asked for the others alone goes on as it is going."""
 _ROUNDING: Final = 1e-4
+_LISTED: Final = ("policy", "learner")
 _ALIKE: Final = ("camera", "rate_hz", "waypoint_s", "goal", "robot")
 
 
@@ -66,11 +67,11 @@ class Batch:
 
 class Examples:
     """All demonstrations, on the device. learned, held_out: rows (M,) of the episodes that are learned from, and of
-    those that are not; meta: of the files, where these agree."""
+    those that are not; meta: of the files, where these agree; policy and learner of all of them."""
 
     def __init__(self, paths: Sequence[Path], seed: int, device: torch.device) -> None:
         packed = [_checked(path) for path in paths]
-        self.meta: dict[str, Any] = packed[0].meta
+        self.meta: dict[str, Any] = dict(packed[0].meta)
         for path, other in zip(paths[1:], packed[1:], strict=True):
             for field in _ALIKE:
                 if other.meta.get(field) != self.meta.get(field):
@@ -78,6 +79,7 @@ class Examples:
                         f"{path}: {field} is {other.meta.get(field)}, and {self.meta.get(field)} in {paths[0]}: train "
                         "on demonstrations that were collected alike"
                     )
+        self.meta |= {name: [value for one in packed for value in one.meta.get(name, [])] for name in _LISTED}
         before = np.cumsum([0, *(len(one) for one in packed)])
         episodes = np.cumsum([0, *(int(one.episode[-1]) + 1 for one in packed)])
         history = np.concatenate([one.history(HISTORY, EVERY) + n for one, n in zip(packed, before, strict=False)])

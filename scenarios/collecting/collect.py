@@ -319,7 +319,7 @@ def _written(
         "policy": demonstrator.manifest.name,
         "policy_source": spec.policy_source,
         "noise": spec.collecting.noise,
-        "learner": spec.collecting.learner,
+        "learner": "" if demonstrator.learner is None else demonstrator.learner.manifest.name,
         "learner_source": spec.learner_source,
         "suite": spec.suite,
         "seed": spec.seed,

@@ -159,6 +159,7 @@ def packed_sets(folders: Sequence[Path], size: tuple[int, int] | None = None, te
     meta = {name: held[0].about[name] for name in _SAME} | {
         "policy": [one.about["policy"] for one in held],
         "noise": [one.about["noise"] for one in held],
+        "learner": [one.about.get("learner", "") for one in held],
         "scenarios": [one["scenario"] for one in listed],
         "structures": [one["structure"] for one in listed],
     }

@@ -60,8 +60,8 @@ def street(episodes: int = 12, length: int = 4, seed: int = 1) -> Packed:
         episode=np.repeat(np.arange(episodes, dtype=np.int32), length),
         frame=np.tile(np.arange(length, dtype=np.int32), episodes),
         meta={
-            "rate_hz": 5.0, "waypoint_s": 0.2, "goal": "route_point", "policy": ["orca"], "robot": "courier",
-            "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
+            "rate_hz": 5.0, "waypoint_s": 0.2, "goal": "route_point", "policy": ["orca"], "learner": [""],
+            "robot": "courier", "camera": {"width": WIDTH_PX, "height": HEIGHT_PX, "fov_deg": 60.0, "mount": "front"},
         },
     )  # fmt: skip
 
@@ -179,6 +179,16 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
         fed = feeder.feed(Observation(row, 0.0, rgb, v_mps, w_radps, COURIER, goal=PointGoal(x_m, y_m)))
         for name, tensor in fed.items():
             np.testing.assert_allclose(tensor[0], getattr(trained_on, name)[row], atol=1e-6)
+
+
+def test_a_bundle_says_who_taught_it_and_who_drove(data: Path, tmp_path: Path) -> None:
+    """Of all files that it learned from: the experts, and the learners beside which they answered."""
+    again = street()
+    replace(again, meta=again.meta | {"policy": ["orca-disturbed"], "learner": ["first"]}).save(tmp_path / "again.npz")
+    meta = Examples([data, tmp_path / "again.npz"], 0, CPU).meta
+    assert manifest_of("small", street().meta, 0)["source"] == "cosim train, seed 0, on what orca drove"
+    told = "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where first drove"
+    assert manifest_of("small", meta, 1)["source"] == told
 
 
 def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
