@@ -32,6 +32,6 @@ def test_a_small_policy_that_ships_is_small_and_answers_without_pytorch(name: st
 @pytest.mark.parametrize("name", SMALL)
 def test_a_small_policy_that_ships_drives_to_a_goal_by_what_it_sees(name: str, tmp_path: Path, cosim: Cosim) -> None:
     """By its name, as any policy: over a crosswalk of the test part, in a city that it has never seen."""
-    said = cosim("run", "unit", "--policy", name, "--scenario", "crosswalk-7012", "--out", "run", cwd=tmp_path)
+    said = cosim("run", "unit", "--policy", name, "--scenario", "crosswalk-7013", "--out", "run", cwd=tmp_path)
     (record,) = read_records(tmp_path / "run")
     assert said.returncode == 0 and record.ended == "goal" and not record.privileged, said.stderr
