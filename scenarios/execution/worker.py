@@ -132,14 +132,16 @@ def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -
 def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
     printed, because a record holds the message alone."""
-    from scenarios.collecting.demonstrator import Demonstrator
     from scenarios.execution.places import check_place
     from scenarios.execution.run import run_episode
 
     if job.net_hash:
         check_place(job.scenario.place, job.net_hash)
-    name, collecting = job.scenario.id, job.options.collecting
-    expert = None if collecting is None else Demonstrator(driver, collecting, job.options.goal)
+    name, expert = job.scenario.id, None
+    if (collecting := job.options.collecting) is not None:
+        from scenarios.collecting.demonstrator import Demonstrator
+
+        expert = Demonstrator(driver, collecting, job.options.goal)
     try:
         if (shared := job.options.renderer) is not None:
             link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))

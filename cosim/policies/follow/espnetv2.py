@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import sys
+from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
@@ -22,6 +23,7 @@ from cosim.policies.follow.networks import ESPNET_GRAPH, ESPNET_WEIGHTS
 from cosim.policies.follow.torch_file import read_torch_file
 from cosim.policies.onnx.making import make_graph, write_graph
 from cosim.policies.onnx.weights import weight_folders
+from cosim.policies.onnx.writing import GraphWriter
 
 HEIGHT: Final = 256
 WIDTH: Final = 512
@@ -44,12 +46,9 @@ class _Builder:
     """Operators one behind the other; a name of a tensor stands for it."""
 
     def __init__(self, weights: dict[str, NDArray[Any]]) -> None:
-        import onnx
-
-        self._onnx, self._weights = onnx, weights
+        self._weights, self._writer = weights, GraphWriter("espnetv2")
         self._left = {name for name in weights if not name.endswith(".num_batches_tracked")}
-        self._nodes: list[Any] = []
-        self._constants: list[Any] = []
+        self._tensors, self._constants = count(), count()
 
     def street(self) -> bytes:
         picture, sizes = "picture", {1: (HEIGHT // 2, WIDTH // 2)}
@@ -75,18 +74,10 @@ class _Builder:
         self._left -= {f"base_net.level{n}_0.eesp.module_act.weight" for n in (2, 3, 4)}
         if self._left:
             raise ValueError(f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there is no place")
-        return self._whole(out)
-
-    def _whole(self, out: str) -> bytes:
-        make, number = self._onnx.helper, self._onnx.TensorProto.FLOAT
-        given = make.make_tensor_value_info("picture", number, [1, 3, HEIGHT, WIDTH])
-        told = make.make_tensor_value_info("scores", number, [1, _CLASSES, HEIGHT // 2, WIDTH // 2])
-        self._nodes.append(make.make_node("Identity", [out], ["scores"]))
-        graph = make.make_graph(self._nodes, "espnetv2", [given], [told], self._constants)
-        model = make.make_model(graph, opset_imports=[make.make_opsetid("", 13)], ir_version=8)
-        self._onnx.checker.check_model(model, full_check=True)
-        data: bytes = model.SerializeToString(deterministic=True)
-        return data
+        self._writer.operator("Identity", "scores", out)
+        return self._writer.whole(
+            {"picture": (1, 3, HEIGHT, WIDTH)}, {"scores": (1, _CLASSES, HEIGHT // 2, WIDTH // 2)}
+        )
 
     def _unit(self, x: str, name: str, dilations: tuple[int, ...], stride: int = 1) -> str:
         """An EESP unit: projected in groups, seen at growing dilations, each added to the one before, joined again."""
@@ -193,14 +184,10 @@ class _Builder:
         return self._weights[name]
 
     def _constant(self, numbers: NDArray[Any]) -> str:
-        name = f"c{len(self._constants)}"
-        self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(numbers), name))
-        return name
+        return self._writer.constant(f"c{next(self._constants)}", numbers)
 
     def _op(self, kind: str, *inputs: str, **how: Any) -> str:
-        name = f"t{len(self._nodes)}"
-        self._nodes.append(self._onnx.helper.make_node(kind, list(inputs), [name], **how))
-        return name
+        return self._writer.operator(kind, f"t{next(self._tensors)}", *inputs, **how)
 
 
 def _parts(count: int, parts: int) -> NDArray[np.float32]:

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
+from cosim.policies.onnx.writing import GraphWriter
 from cosim.policies.published.making import PublishedNetwork
-from cosim.policies.published.writing import GraphWriter
 
 _SIDE: Final = 200
 _PLANES: Final = (32, 32, 64, 128)
@@ -74,7 +74,7 @@ class _Layers:
         write("Identity", "collision_prob", collision)
         if self._left:
             raise ValueError(f"holds '{min(self._left)}', and {len(self._left) - 1} more, of which there is no place")
-        return self._writer.whole({"image": (1, _SIDE, _SIDE)}, {"steering": (1,), "collision_prob": (1,)})
+        return self._writer.whole({"image": ("N", 1, _SIDE, _SIDE)}, {"steering": ("N", 1), "collision_prob": ("N", 1)})
 
     def _block(self, x: str, i: int, planes: int, more: int) -> str:
         """A residual block: two convolutions, each after its normalisation, beside one of single pixels."""

@@ -14,9 +14,9 @@ from typing import Final
 
 from cosim.policies.onnx.manifest import FileFacts
 from cosim.policies.onnx.weights import NetworkFile
+from cosim.policies.onnx.writing import GraphWriter, PortShapes
 from cosim.policies.published.making import PublishedNetwork
 from cosim.policies.published.openbot.lite_file import LiteModel, LiteOperator, LiteTensor, read_lite_file
-from cosim.policies.published.writing import GraphWriter
 
 _INPUTS: Final = {"img_input": ("img", (96, 256, 3)), "cmd_input": ("cmd", (1,))}
 """What the inputs of the file are called here, and their shapes without the first axis."""
@@ -51,7 +51,8 @@ class _Translation:
         for number, operator in enumerate(self._model.operators):
             self._names[operator.output] = self._translated(number, operator)
         self._writer.operator("Identity", name, self._name(self._model.outputs[0]))
-        return self._writer.whole(dict(_INPUTS.values()), {name: shape})
+        inputs: PortShapes = {called: ("N", *sides) for called, sides in _INPUTS.values()}
+        return self._writer.whole(inputs, {name: ("N", *shape)})
 
     def _translated(self, number: int, operator: LiteOperator) -> str:
         """The name of what the operator makes."""

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-PortShapes = Mapping[str, tuple[int, ...]]
-"""Of tensors by their names, without the first axis, which may be of any length."""
+PortShapes = Mapping[str, tuple[int | str, ...]]
+"""Of tensors by their names; an axis that has a name may be of any length."""
 
 
 class GraphWriter:
-    """A graph of float32; a tensor is known by its name. The same calls give the same bytes."""
+    """A graph with inputs and outputs of float32; a tensor is known by its name. The same calls give the same bytes."""
 
     def __init__(self, name: str) -> None:
         import onnx
@@ -22,7 +22,7 @@ class GraphWriter:
         self._nodes: list[Any] = []
         self._constants: list[Any] = []
 
-    def constant(self, name: str, numbers: NDArray[np.float32]) -> str:
+    def constant(self, name: str, numbers: NDArray[Any]) -> str:
         """Numbers that the graph holds."""
         self._constants.append(self._onnx.numpy_helper.from_array(np.ascontiguousarray(numbers), name))
         return name
@@ -46,4 +46,4 @@ class GraphWriter:
 
     def _ports(self, shapes: PortShapes) -> list[Any]:
         number = self._onnx.TensorProto.FLOAT
-        return [self._onnx.helper.make_tensor_value_info(name, number, ["N", *sides]) for name, sides in shapes.items()]
+        return [self._onnx.helper.make_tensor_value_info(name, number, list(shape)) for name, shape in shapes.items()]
