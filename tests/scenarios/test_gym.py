@@ -35,7 +35,7 @@ from scenarios.execution.run import run_episode
 from scenarios.gym.learned import LearnedPolicy
 from scenarios.gym.reward import Transition, usual_reward
 from scenarios.gym.spaces import action_as_answer, action_space_of, seen_by, seen_space
-from tests.conftest import PATIENCE_S
+from tests.conftest import PATIENCE_S, still_runs
 from tests.scenarios.gym_suite import BLIND, COUNT, short_ways
 
 MODULE = (sys.executable, "-m", "tests.scenarios.gym_suite")
@@ -291,20 +291,12 @@ def test_what_goes_wrong_in_one_of_them_is_told_and_nothing_outlives_them() -> N
     pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
     with subprocess.Popen([*MODULE, "killed"], text=True, **pipes) as made:
         pids = [int(word) for word in made.stdout.readline().split()]
-        assert len(pids) == 2 and all(map(_lives, pids))
+        assert len(pids) == 2 and all(map(still_runs, pids))
         made.kill()
     deadline = time.monotonic() + PATIENCE_S
-    while any(map(_lives, pids)) and time.monotonic() < deadline:
+    while any(map(still_runs, pids)) and time.monotonic() < deadline:
         time.sleep(0.02)
-    assert not any(map(_lives, pids))
-
-
-def _lives(pid: int) -> bool:
-    try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
-    except (FileNotFoundError, ProcessLookupError):  # the second: it went between the opening and the reading
-        return False
-    return stat.rpartition(")")[2].split()[0] != "Z"
+    assert not any(map(still_runs, pids))
 
 
 @pytest.mark.engine

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import psutil
 import pytest
 
 from cosim import run
@@ -21,7 +20,7 @@ from cosim.records.run_folder import read_spec
 from cosim.spec.scenario import Suite, write_suite
 from scenarios.checks import small_scenario
 from scenarios.many.on_ray import RayWorkers, ray_cluster
-from tests.conftest import PATIENCE_S, Cosim
+from tests.conftest import PATIENCE_S, Cosim, still_runs
 
 POLICY = '''
 import os, time
@@ -70,11 +69,6 @@ def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, list[
             cluster.shutdown()
 
 
-def _runs(pid: int) -> bool:
-    """Whether a process goes on; one that nobody has buried does not."""
-    return psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
-
-
 @pytest.mark.engine
 def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
     tmp_path: Path, nodes: tuple[Any, list[Any], Path], cosim: Cosim
@@ -93,7 +87,7 @@ def test_a_run_by_ray_is_the_run_of_one_process_also_when_a_node_dies(
         begun = [int(path.name.split("-")[1]) for path in go.parent.glob("begun-*")]
         cluster.remove_node(first, allow_graceful=False)
         until_s = time.monotonic() + PATIENCE_S
-        while all(map(_runs, begun)) and time.monotonic() < until_s:  # what ran there must not come to its end first
+        while all(map(still_runs, begun)) and time.monotonic() < until_s:  # what ran there must not end first
             time.sleep(0.05)
         go.touch()
 
