@@ -30,6 +30,8 @@ FOLLOW = "follow"
 """The policy of `cosim.policies.follow`, which sees by networks whose weights are not included."""
 ONNX_SCHEME = "onnx:"
 """Before the folder of an ONNX bundle (`cosim.policies.onnx`)."""
+REMOTE_SCHEME = "zenoh:"
+"""Before the name of a policy that `cosim serve` or `bridge/policy_server.py` serves."""
 
 
 def load_policy(name: str, timer: Timer | None = None) -> Driver:
@@ -42,6 +44,8 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
     """
     if name.startswith(ONNX_SCHEME):
         return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser()), timer)
+    if name.startswith(REMOTE_SCHEME):
+        raise UsageError(f"policy '{name}' is served elsewhere; here it must be one that this process can load")
     if ":" not in name:
         if name in POLICIES:
             policy = POLICIES[name]()

@@ -65,7 +65,8 @@ def _ticks(time_s: float) -> int:
 
 
 def check_learner(learner: Manifest, collecting: Collecting, expert: Manifest, goal: GoalProtocol) -> None:
-    """Raises UsageError where a learner would be given something else than what is collected. goal: of the rows."""
+    """Raises UsageError where a learner would be given something else than what is collected, or cannot do with it.
+    goal: of the rows."""
     if expert.camera is not None:
         raise UsageError(
             f"expert '{expert.name}' sees by a camera of its own, and a learner drives beside one that does not"
@@ -73,11 +74,26 @@ def check_learner(learner: Manifest, collecting: Collecting, expert: Manifest, g
     camera = learner.camera
     if camera is None or learner.privileged or learner.cameras or learner.odometry != "none":
         raise UsageError(f"learner '{learner.name}' is no policy that drives by one camera, speeds and a goal alone")
-    if (camera, learner.rate_hz, learner.goal) != (collecting.camera, collecting.rate_hz, goal):
+    if (camera, learner.rate_hz) != (collecting.camera, collecting.rate_hz):
+        seen, kept = f"{camera.in_words}, {learner.rate_hz:g} Hz", collecting.camera.in_words
         raise UsageError(
-            f"learner '{learner.name}' is to see what is collected: give --camera {camera.width}x{camera.height} --fov "
-            f"{camera.fov_deg:g} --mount {camera.mount} --rate {learner.rate_hz:g} --goal {learner.goal}"
+            f"learner '{learner.name}' is to see what is collected. It sees by {seen}, collected is {kept}, "
+            f"{collecting.rate_hz:g} Hz: {_asked_for(camera, learner.rate_hz)}"
         )
+    if learner.goals and goal not in learner.goals:
+        could = ", ".join(learner.goals)
+        raise UsageError(f"learner '{learner.name}' cannot do with goal '{goal}': give --goal, one of {could}")
+
+
+def _asked_for(camera: CameraSpec, rate_hz: float) -> str:
+    """How these pictures are asked for."""
+    plain = CameraSpec(camera.width, camera.height, camera.fov_deg, camera.mount)
+    if camera != plain or not isinstance(camera.mount, str):
+        return "such pictures cannot be collected; give a learner with a plain camera at one of the robot's mounts"
+    return (
+        f"give --camera {camera.width}x{camera.height} --fov {camera.fov_deg:g} --mount {camera.mount} "
+        f"--rate {rate_hz:g}"
+    )
 
 
 def demonstrating(expert: Manifest, collecting: Collecting, goal: GoalProtocol | None = None) -> Manifest:

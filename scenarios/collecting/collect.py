@@ -34,11 +34,11 @@ from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.builders.fits import check_places
 from scenarios.catalog import with_robot
 from scenarios.collecting.demonstration import Demonstration
-from scenarios.collecting.demonstrator import Demonstrator
+from scenarios.collecting.demonstrator import Demonstrator, learner_of
 from scenarios.collecting.fresh import Fresh
 from scenarios.collecting.lerobot import Collected, Filmed, write_lerobot
 from scenarios.collecting.reading import ReadBack, read_back
-from scenarios.execution.messages import Hear, Hello
+from scenarios.execution.messages import Hear, Hello, Learner
 from scenarios.execution.pool import run_all
 from scenarios.execution.process import LocalProcesses
 from scenarios.execution.suite_run import run_spec
@@ -62,11 +62,11 @@ class CollectSpec(msgspec.Struct, frozen=True, kw_only=True):
     episodes: int
     policy: str
     policy_source: str
-    learner_source: str = ""
     robot: str = ""
     goal: str
     seed: int
     collecting: Collecting
+    learner_source: str = ""
     renderer: str
     versions: dict[str, str]
 
@@ -136,11 +136,14 @@ def collect(
     """
     check_parquet()
     options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
-    demonstrator = Demonstrator(expert, collecting, options.goal)
+    learner = learner_of(collecting)
+    demonstrator = Demonstrator(expert, collecting, options.goal, learner)
     wanted = episodes or (len(source.structures) * len(source.seeds) if isinstance(source, Fresh) else None)
     rounds = _Rounds(source, out.absolute(), policy, demonstrator, options, jobs, tell)
     spec = rounds.asked(wanted or len(rounds.all), expert)
     _open(out, spec, resume)
+    beside = None if learner is None else Learner(collecting.learner, learner.manifest, learner.source_hash)
+    hello = Hello(policy, expert.manifest, expert.source_hash, learner=beside)
     with ExitStack() as stack:
         found: list[Collected] = []
         dropped, run, taken, number = Counter[str](), 0, 0, 0
@@ -150,7 +153,7 @@ def collect(
             held, scenarios = rounds.opened(stack, number, taken, count)
             if held is None:
                 break
-            rounds.run(held, scenarios, Hello(policy, expert.manifest, expert.source_hash), showing)
+            rounds.run(held, scenarios, hello, showing)
             found += _kept(held, scenarios, dropped)
             run += len(scenarios)
             taken, number = taken + count, number + 1
@@ -196,11 +199,11 @@ class _Rounds:
             episodes=episodes if is_fresh else min(episodes, len(self.all)),
             policy=self.policy,
             policy_source=expert.source_hash,
-            learner_source="" if (learner := self.demonstrator.learner) is None else learner.source_hash,
             robot=self.options.robot,
             goal=self.demonstrator.manifest.goal,
             seed=self.options.seed or 0,
             collecting=self.options.collecting or Collecting(),
+            learner_source="" if (learner := self.demonstrator.learner) is None else learner.source_hash,
             renderer=told.renderer,
             versions=versions(),
         )

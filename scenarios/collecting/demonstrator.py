@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from functools import cache
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.clock import Clock
+from cosim.core.errors import UsageError
 from cosim.core.state import Command
 from cosim.episode.control import clipped
 from cosim.episode.driver import Driver
@@ -36,10 +35,13 @@ _TURN: Final = 0.8
 
 
 class Demonstrator(Driver):
-    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. A learner that drives is asked
-    at every picture, so that it knows those before (Ross et al., DAgger, 2011). Raises UsageError."""
+    """The expert as it is asked in an episode. goal: of the run; see `EpisodeOptions`. learner: where one drives at
+    times (`learner_of`); it is asked at every picture, so that it knows those before (Ross et al., DAgger, 2011).
+    Raises UsageError."""
 
-    def __init__(self, expert: Driver, collecting: Collecting, goal: GoalProtocol | None = None) -> None:
+    def __init__(
+        self, expert: Driver, collecting: Collecting, goal: GoalProtocol | None = None, learner: Driver | None = None
+    ) -> None:
         manifest = with_goal(demonstrating(expert.manifest, collecting, goal), None)
         super().__init__(expert, manifest, expert.source_hash)
         self.runs, self.at_once = expert.runs, expert.at_once
@@ -47,9 +49,9 @@ class Demonstrator(Driver):
         self._sees = expert.manifest.camera is not None
         self._rows = _Rows(manifest.rate_hz)
         self._bursts = _Bursts(0, collecting)
-        self.learner = _learner(collecting.learner) if collecting.learner else None
-        if self.learner is not None:
-            check_learner(self.learner.manifest, collecting, expert.manifest, manifest.goal)
+        self.learner = learner
+        if learner is not None:
+            check_learner(learner.manifest, collecting, expert.manifest, manifest.goal)
 
     @property
     def clock(self) -> dict[str, float]:
@@ -69,7 +71,7 @@ class Demonstrator(Driver):
         rgb = observation.pictures[EYE].rgb if self._sees else observation.rgb
         assert rgb is not None
         answer = self._expert.act(observation)
-        learned = None if self.learner is None else self.learner.act(replace(observation, privileged=None))
+        learned = None if self.learner is None else self.learner.act(observation)
         driven = self._bursts.driven(answer, observation.robot, learned)
         self._rows.add(observation, rgb, answer, driven is not answer)
         return driven
@@ -91,10 +93,12 @@ def solved(record: Record, log: Log) -> bool:
     return record.status == "done" and record.measures["success"] == 1.0 and bool(np.isnan(log.reset_s_m).all())
 
 
-@cache
-def _learner(name: str) -> Driver:
-    """One for all episodes of a process."""
-    return load_policy(name)
+def learner_of(collecting: Collecting) -> Driver | None:
+    """The learner of what is collected as it is now. Raises UsageError."""
+    try:
+        return load_policy(collecting.learner) if collecting.learner else None
+    except UsageError as error:
+        raise UsageError(f"learner: {error}") from error
 
 
 class _Bursts:

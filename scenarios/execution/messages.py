@@ -13,6 +13,14 @@ from cosim.spec.policy_host import PolicyHost
 from cosim.spec.scenario import Scenario
 
 
+class Learner(msgspec.Struct, frozen=True):
+    """Who drives at times in place of an expert whose drives are collected, and what that was for the run."""
+
+    policy: str
+    manifest: Manifest
+    source_hash: str
+
+
 class Hello(msgspec.Struct, frozen=True, tag=True):
     """The first message to a worker: which policy it drives with, and what that was for the run. renderer: the run's
     shared one, where there is one. host: where the policy is."""
@@ -22,6 +30,7 @@ class Hello(msgspec.Struct, frozen=True, tag=True):
     source_hash: str
     renderer: RendererAt | None = None
     host: PolicyHost = PolicyHost()
+    learner: Learner | None = None
 
 
 class Job(msgspec.Struct, frozen=True, tag=True):

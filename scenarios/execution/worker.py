@@ -9,7 +9,9 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from socket import socket
@@ -20,6 +22,7 @@ from cosim.core.errors import MachineError, RendererLost, UsageError
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
+from cosim.policies.load import load_policy
 from scenarios.execution.asked import Asked
 from scenarios.execution.messages import (
     Compares,
@@ -28,6 +31,7 @@ from scenarios.execution.messages import (
     Hear,
     Hello,
     Job,
+    Learner,
     LostRenderer,
     Message,
     Progress,
@@ -57,7 +61,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
     hello = decode_hello(wire.receive())
     _import_engines(say)
     timer = Asked(asked_descriptor)
-    driver: Driver | None = driver_here(hello, timer, say)
+    drivers: Drivers | None = drivers_here(hello, timer, say)
     say(Ready())
     while True:
         try:
@@ -65,15 +69,15 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
         except EOFError:
             return
         os.chdir(home)  # the policy may have gone elsewhere
-        driver = driver or driver_here(hello, timer, say, again=True)
+        drivers = drivers or drivers_here(hello, timer, say, again=True)
         try:
-            done, trouble = run_job(job, driver, say)
+            done, trouble = run_job(job, drivers.policy, say, drivers.learner)
         except MachineError as lack:
             say(Unable(str(lack), blames_policy=False))
             raise
-        if trouble or driver.spent:
-            driver.close()
-            driver = None  # made anew for the next one
+        if trouble or drivers.spent:
+            drivers.close()
+            drivers = None  # made anew for the next one
         say(done)
         if _printed_to() != printed_to:
             return  # the policy has closed it: what was opened since may have its number, and would be written into
@@ -98,40 +102,72 @@ def _import_engines(say: Hear) -> None:
         raise
 
 
-def driver_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:
-    """What drives here: the policy, or who asks the shared renderer's."""
+@dataclass(frozen=True)
+class Drivers:
+    """What drives here: the policy, or who asks the shared renderer's; and the learner where drives are collected."""
+
+    policy: Driver
+    learner: Driver | None
+
+    @property
+    def spent(self) -> bool:
+        return self.policy.spent
+
+    def close(self) -> None:
+        self.policy.close()
+        if self.learner is not None:
+            self.learner.close()
+
+
+def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Drivers:
+    """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
-        return AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
-    return policy_here(hello, timer, say, again=again)
+        driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
+    else:
+        driver = policy_here(hello, timer, say, again=again)
+    if (learner := hello.learner) is None:
+        return Drivers(driver, None)
+    with _unable_told(say):
+        return Drivers(driver, _as_begun(load_policy(learner.policy, timer), learner, again))
 
 
 def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:
     """The policy of the run. One that cannot be loaded here, or is another one here, is told, and ends the process.
 
     again: it was loaded here before; what it has made of its class's manifest since means nothing."""
+    with _unable_told(say):
+        return _as_begun(policy_driver(hello.policy, hello.host, timer, hello.manifest), hello, again)
+
+
+@contextmanager
+def _unable_told(say: Hear) -> Iterator[None]:
     try:
-        driver = policy_driver(hello.policy, hello.host, timer, hello.manifest)
-        if driver.source_hash != hello.source_hash:
-            raise UsageError(
-                f"policy '{hello.policy}' was edited while the run was going on: begin another run. Or it is a network "
-                "on another kind of processor than the run's, which answers otherwise in the last bit"
-            )
-        if again:
-            driver.manifest = hello.manifest
-        if driver.manifest != hello.manifest:
-            raise UsageError(
-                f"policy '{hello.policy}' has another manifest in each process: {driver.manifest} in this one, "
-                f"{hello.manifest} in the first"
-            )
+        yield
     except (UsageError, MachineError) as error:
         say(Unable(str(error), blames_policy=isinstance(error, UsageError)))
         raise
+
+
+def _as_begun(driver: Driver, begun: Hello | Learner, again: bool) -> Driver:
+    """A driver that was loaded here, if it is what it was for the run. Raises UsageError."""
+    if driver.source_hash != begun.source_hash:
+        raise UsageError(
+            f"policy '{begun.policy}' was edited while the run was going on: begin another run. Or it is a network "
+            "on another kind of processor than the run's, which answers otherwise in the last bit"
+        )
+    if again:
+        driver.manifest = begun.manifest
+    if driver.manifest != begun.manifest:
+        raise UsageError(
+            f"policy '{begun.policy}' has another manifest in each process: {driver.manifest} in this one, "
+            f"{begun.manifest} in the first"
+        )
     return driver
 
 
-def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, bool]:
+def run_job(job: Job, driver: Driver, say: Hear, learner: Driver | None = None) -> tuple[Done | LostRenderer, bool]:
     """Run one episode and tell how it goes. Returns what came out, and whether anything went wrong: its traceback is
-    printed, because a record holds the message alone."""
+    printed, because a record holds the message alone. learner: of a job that is collected."""
     from scenarios.execution.places import check_place
     from scenarios.execution.run import run_episode
 
@@ -141,7 +177,7 @@ def run_job(job: Job, driver: Driver, say: Hear) -> tuple[Done | LostRenderer, b
     if (collecting := job.options.collecting) is not None:
         from scenarios.collecting.demonstrator import Demonstrator
 
-        expert = Demonstrator(driver, collecting, job.options.goal)
+        expert = Demonstrator(driver, collecting, job.options.goal, learner)
     try:
         if (shared := job.options.renderer) is not None:
             link_to(shared.address, lambda: say(Waits(name, "waits for the shared renderer")))

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Final
-
 from cosim.core.errors import UsageError
 from cosim.episode.driver import Driver, Timer
 from cosim.episode.ports import Manifest
-from cosim.policies.load import load_policy
+from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.spec.policy_host import PolicyHost
 from scenarios.serving.isolated import isolated_driver
-
-SCHEME: Final = "zenoh:"
-"""Before the name of a policy that `cosim serve` or `bridge/policy_server.py` serves."""
 
 
 def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expected: Manifest | None = None) -> Driver:
@@ -22,14 +17,14 @@ def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expec
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
-    if name.startswith(SCHEME):
+    if name.startswith(REMOTE_SCHEME):
         from scenarios.serving.remote import remote_driver
 
         if host.isolated:
             raise UsageError(f"policy '{name}' is elsewhere anyway: leave --isolated out")
         return remote_driver(name, host, timer)
     if host.servers:
-        raise UsageError(f"--policy-at goes with --policy {SCHEME}NAME, not with '{name}'")
+        raise UsageError(f"--policy-at goes with --policy {REMOTE_SCHEME}NAME, not with '{name}'")
     if host.isolated:
         return isolated_driver(name, timer, expected, host.run)
     return load_policy(name, timer)

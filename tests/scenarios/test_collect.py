@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar, NamedTuple
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -18,7 +20,7 @@ from cosim.core.packed import Packed, read_packed
 from cosim.core.state import Command
 from cosim.episode.driver import Driver
 from cosim.episode.log import Log
-from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.episode.ports import CameraSpec, Manifest, Observation, Policy
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies.load import load_policy
 from cosim.records.run_folder import DEMONSTRATION
@@ -84,9 +86,12 @@ def packed(desk: Desk, cosim: Cosim) -> Packed:
     return read_packed(desk.folder / "demos.npz")
 
 
-def shown_here(way: Scenario, expert: Driver, collecting: Collecting = NOISY) -> Demonstration:
+def shown_here(
+    way: Scenario, expert: Driver, collecting: Collecting = NOISY, learner: Policy | None = None
+) -> Demonstration:
     """The demonstration of an episode that this process drives."""
-    demonstrator = Demonstrator(expert, collecting, "route_point")
+    beside = None if learner is None else Driver.of(learner)
+    demonstrator = Demonstrator(expert, collecting, "route_point", beside)
     options = EpisodeOptions(goal="route_point", seed=0)
     outcome = run_episode(way, demonstrator, options)
     return Demonstration.decoded(demonstrator.kept(way, outcome.record, outcome.log), way.id)
@@ -219,7 +224,9 @@ class Learner(Stands):
     """Drives on, and knows nothing that a picture does not show. asked: the ticks of an episode."""
 
     manifest = Manifest("learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point")
-    asked: ClassVar[list[int]] = []
+
+    def reset(self, episode_id: str, seed: int) -> None:
+        self.asked: list[int] = []
 
     def act(self, observation: Observation) -> Command:
         assert observation.privileged is None
@@ -231,30 +238,100 @@ class Learner(Stands):
 def test_a_learner_drives_and_the_expert_says_what_it_should_have_done(desk: Desk) -> None:
     """It is asked at every picture, drives its share of the time, seconds at once, while each row has the expert's
     answer; the same seed gives the same bytes."""
-    camera = CameraSpec(width=64, height=48)
-    called = f"{__name__}:Learner"
-    kept = Collecting(camera=camera, noise=0.6, learner=called, unsolved=True)
-    way = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0)
-    shown = shown_here(way, Driver.of(Stands()), kept)
-    learner = sys.modules[__name__].Learner
+    kept = Collecting(camera=CameraSpec(width=64, height=48), noise=0.6, learner="learner", unsolved=True)
+    way, learner = msgspec.structs.replace(desk.ways[0], time_limit_s=20.0), Learner()
+    shown = shown_here(way, Driver.of(Stands()), kept, learner)
     assert learner.asked == sorted(set(learner.asked)) and len(learner.asked) == len(shown) > 20
     assert not shown.command.any()
     assert 0.3 < shown.disturbed.mean() < 0.9
     begins = np.flatnonzero(shown.disturbed[1:] & ~shown.disturbed[:-1])
     assert begins.size and shown.disturbed.sum() / (begins.size + 1) >= 5
     assert shown.state[1:, 0][shown.disturbed[:-1]].mean() > 0.4 > shown.state[1:, 0][~shown.disturbed[:-1]].mean()
-    assert shown_here(way, Driver.of(Stands()), kept).encoded() == shown.encoded()
+    assert shown_here(way, Driver.of(Stands()), kept, learner).encoded() == shown.encoded()
+
+
+BESIDE = """
+import os, signal
+from cosim.core.state import Command
+from cosim.episode.ports import CameraSpec, Manifest
+
+
+class Learner:
+    manifest = Manifest("learner", rate_hz=5.0, camera=CameraSpec(width=64, height=48), goal="route_point")
+
+    def reset(self, episode_id, seed):
+        self.asked = 0
+
+    def act(self, observation):
+        self.asked += 1
+        return Command(0.7, 0.3 - 0.1 * (self.asked % 7))
+
+
+class Another(Learner):
+    manifest = Manifest(f"learner-{os.getpid()}", rate_hz=5.0, camera=Learner.manifest.camera, goal="route_point")
+
+
+class Dies(Learner):
+    def act(self, observation):
+        os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_learner_drives_in_every_process_as_it_does_in_this_one(
+    desk: Desk, cosim: Cosim, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes with a learner of one's own write the bytes of one; the data set tells which it was, and is not
+    gone on with by another one, or by what the same name means now."""
+    (desk.folder / "beside.py").write_text(BESIDE)
+    some = ("--scenario", "way-0", "--scenario", "way-2")
+    asked = ("collect", "ways.json", *some, "--camera", "64x48", "--noise", "0.6", "--unsolved", "--out", "taught")
+    said = cosim(*asked, "--learner", "beside:Learner", "--jobs", "2", cwd=desk.folder)
+    assert said.returncode == 0, said.stderr
+    monkeypatch.syspath_prepend(desk.folder)
+    learner = load_policy("beside:Learner")
+    kept = Collecting(camera=CameraSpec(width=64, height=48), noise=0.6, learner="beside:Learner", unsolved=True)
+    for way in (desk.ways[0], desk.ways[2]):
+        shown = shown_here(way, load_policy("orca"), kept, learner)
+        assert shown.disturbed.any()
+        assert (desk.folder / f"taught/runs/00/episodes/{way.id}" / DEMONSTRATION).read_bytes() == shown.encoded()
+    told = json.loads((desk.folder / "taught/meta/cosim.json").read_bytes())
+    assert (told["learner"], told["learner_source"]) == ("learner", learner.source_hash)
+
+    said = cosim(*asked, "--learner", "beside:Another", "--resume", cwd=desk.folder)
+    assert said.returncode == 2 and "its learner is beside:Learner, now asked for is beside:Another" in said.stderr
+    (desk.folder / "beside.py").write_text(BESIDE.replace("0.7", "0.6"))
+    said = cosim(*asked, "--learner", "beside:Learner", "--resume", cwd=desk.folder)
+    assert said.returncode == 2 and "is of another data set: its learner_source is" in said.stderr
+
+
+def test_a_learner_that_fails_is_told_as_a_policy_is(desk: Desk, cosim: Cosim) -> None:
+    """One that is another in each process ends the run; one that dies has crashed its episodes."""
+    (desk.folder / "failing.py").write_text(BESIDE)
+    asked = ("collect", "ways.json", "--scenario", "way-0", "--camera", "64x48", "--noise", "0.6", "--learner")
+    said = cosim(*asked, "failing:Another", "--out", "other", cwd=desk.folder)
+    assert said.returncode == 2 and "policy 'failing:Another' has another manifest in each process" in said.stderr
+    said = cosim(*asked, "failing:Dies", "--out", "dead", cwd=desk.folder)
+    assert said.returncode == 2 and "nothing to keep of 1 episodes: crashed (1)" in said.stderr, said.stderr
+    said = cosim(*asked, "zenoh:mine", "--out", "far", cwd=desk.folder)
+    assert said.returncode == 2 and "learner: policy 'zenoh:mine' is served elsewhere" in said.stderr
 
 
 def test_a_learner_that_would_see_something_else_is_refused() -> None:
     """With what to give; so is one beside an expert that sees by a camera of its own, and one that is blind."""
-    asked = Collecting(camera=CameraSpec(width=80, height=60), noise=0.6, learner=f"{__name__}:Learner")
-    with pytest.raises(UsageError, match="give --camera 64x48 --fov 75 --mount front --rate 5 --goal route_point"):
-        Demonstrator(Driver.of(Stands()), asked)
+    asked = Collecting(camera=CameraSpec(width=80, height=60), noise=0.6, learner="learner")
+    expert, learner = Driver.of(Stands()), Driver.of(Learner())
+    with pytest.raises(UsageError, match=r"front, 80 x 60 px.* give --camera 64x48 --fov 75 --mount front --rate 5$"):
+        Demonstrator(expert, asked, None, learner)
+    learner.manifest = replace(learner.manifest, camera=CameraSpec(80, 60, crop=(0, 20, 80, 60)))
+    with pytest.raises(UsageError, match=r"crop 0 20 80 60, 5 Hz, collected is .*: such pictures cannot be collected"):
+        Demonstrator(expert, asked, None, learner)
+    learner.manifest = replace(learner.manifest, camera=asked.camera, goals=("final_point", "none"))
+    with pytest.raises(UsageError, match="cannot do with goal 'route_point': give --goal, one of final_point, none"):
+        Demonstrator(expert, asked, None, learner)
     with pytest.raises(UsageError, match="'stands' is no policy that drives by one camera, speeds and a goal alone"):
-        Demonstrator(Driver.of(Stands()), msgspec.structs.replace(asked, learner=f"{__name__}:Stands"))
+        Demonstrator(expert, asked, None, Driver.of(Stands()))
     with pytest.raises(UsageError, match="expert 'sees' sees by a camera of its own"):
-        Demonstrator(Driver.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0))
+        Demonstrator(Driver.of(Sees()), msgspec.structs.replace(asked, rate_hz=4.0), None, learner)
     with pytest.raises(SpecError, match="give --noise"):
         msgspec.structs.replace(asked, noise=0.0)
 
