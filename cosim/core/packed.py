@@ -19,6 +19,7 @@ meta        () str                 JSON, see `Packed.meta`
 
 from __future__ import annotations
 
+import hashlib
 import json
 import zipfile
 from dataclasses import dataclass, fields
@@ -82,6 +83,17 @@ class Packed:
             part.replace(path)
         except OSError as error:
             raise unwritable(path, error) from error
+
+
+def packed_digest(path: Path) -> str:
+    """Of all that a file holds, by the checksums that it holds itself: two packed of the same have the same. Raises
+    RunError naming it where it holds none."""
+    try:
+        with zipfile.ZipFile(path) as held:
+            told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
+    except (OSError, zipfile.BadZipFile) as error:
+        raise RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`") from error
+    return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
 
 
 def read_packed(path: Path) -> Packed:

@@ -22,5 +22,14 @@ def duration(seconds: float) -> str:
     return f"{hours} h {rest} min" if rest else f"{hours} h"
 
 
+def milliseconds(ms: float) -> str:
+    """A short time in words, to three figures: 0.43 ms, 70.3 ms, 1,235 ms.
+
+    >>> milliseconds(70.345), milliseconds(1234.5)
+    ('70.3 ms', '1,234 ms')
+    """
+    return f"{ms:.3g} ms" if abs(ms) < 999.5 else f"{ms:,.0f} ms"
+
+
 def untold(stage: str, share: float | None = None, /) -> None:
     """Nobody wants to know."""

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -34,9 +34,27 @@ MODEL: Final = "model.onnx"
 _TOLERANCE: Final = 1e-4
 
 
-def write_bundle(folder: Path, parameters: Parameters, examples: Examples, name: str, seed: int) -> None:
-    """Write it, with the first held-out example. Raises RunError where the graph does not answer as the network does,
-    or what it answers is no number."""
+class BundleFacts(NamedTuple):
+    """What is told of a bundle that a training begins with. digest: of its graph."""
+
+    name: str
+    digest: str
+
+
+def bundle_facts(folder: Path) -> BundleFacts:
+    """Raises RunError where there is no such bundle."""
+    path = folder / MODEL
+    try:
+        digest = hashlib.blake2b(path.read_bytes(), digest_size=8).hexdigest()
+        path = folder / "manifest.json"
+        return BundleFacts(str(json.loads(path.read_bytes())["name"]), digest)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(f"{path}: cannot be read: {getattr(error, 'strerror', None) or error!r}") from error
+
+
+def write_bundle(folder: Path, parameters: Parameters, examples: Examples, name: str, source: str) -> None:
+    """Write it, with the first held-out example. source: what it was made of. Raises RunError where the graph does not
+    answer as the network does, or what it answers is no number."""
     graph = graph_of(parameters)
     batch = examples.rows(examples.held_out[:1])
     inputs = {key: getattr(batch, key).cpu().numpy().astype(np.float32) for key in INPUTS}
@@ -48,7 +66,7 @@ def write_bundle(folder: Path, parameters: Parameters, examples: Examples, name:
         raise RunError(f"{folder}: the graph answers {off:g} otherwise than the network: train anew, at a lower --rate")
     example = io.BytesIO()
     np.savez_compressed(example, **{**inputs, f"expected.{PLAN}": wanted})
-    manifest = {**manifest_of(name, examples.meta, seed), "files": {MODEL: _facts(graph)}}
+    manifest = {**manifest_of(name, examples.meta, source), "files": {MODEL: _facts(graph)}}
     write_whole(folder / MODEL, graph)
     write_whole(folder / "example.npz", example.getvalue())
     write_whole(folder / "manifest.json", (json.dumps(manifest, indent=2) + "\n").encode())
@@ -59,17 +77,24 @@ def _facts(data: bytes) -> dict[str, Any]:
     return {"bytes": len(data), "blake2b": hashlib.blake2b(data, digest_size=32).hexdigest()}
 
 
-def manifest_of(name: str, meta: dict[str, Any], seed: int) -> dict[str, Any]:
-    """What the graph wants and answers, by what the demonstrations say of themselves."""
+def source_of(meta: dict[str, Any], seed: int, begun: BundleFacts | None = None) -> str:
+    """What a network was made of, by what the demonstrations say of themselves."""
     experts, learners = (", ".join(dict.fromkeys(filter(None, meta[name]))) for name in ("policy", "learner"))
     taught = f", and would have done where {learners} drove" if learners else ""
+    return f"cosim train, seed {seed}, on what {experts} drove{taught}" + (
+        f"; begun with {begun.name}" if begun else ""
+    )
+
+
+def manifest_of(name: str, meta: dict[str, Any], source: str) -> dict[str, Any]:
+    """What the graph wants and answers, by what the demonstrations say of themselves."""
     camera = {field: meta["camera"].get(field) for field in ("width", "height", "fov_deg", "mount", "crop")}
     return {
         "format": 1,
         "name": name,
         "version": "1",
         "licence": "Apache-2.0",
-        "source": f"cosim train, seed {seed}, on what {experts} drove{taught}",
+        "source": source,
         "rate_hz": meta["rate_hz"],
         "goal": meta["goal"],
         "camera": camera,

@@ -19,8 +19,9 @@ from torch import Tensor
 from torch.nn import functional
 
 from cosim.core.errors import RunError, UsageError, unwritable
+from cosim.core.packed import packed_digest
 from cosim.core.whole_file import write_whole
-from cosim.learning.bundle import write_bundle
+from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
 from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import parameters_of
 from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, new_parameters, plan, turns_radps
@@ -113,10 +114,11 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
     kept = folder / CHECKPOINT
     if kept.exists() and not resume:
         raise RunError(f"{folder}: holds a training: go on with it by --resume, or choose another folder")
-    begin = None if training.begin is None or kept.exists() else parameters_of(training.begin / "model.onnx")
+    begin = None if training.begin is None or kept.exists() else parameters_of(training.begin / MODEL)
+    begun = None if training.begin is None else bundle_facts(training.begin)
     examples = Examples(paths, training.seed, device)
     folder.mkdir(parents=True, exist_ok=True)
-    spec = training.spec | {"rows": len(examples.learned), "held_out": len(examples.held_out)}
+    spec = training.spec | {"data": ", ".join(map(packed_digest, paths)), "from": begun and begun.digest}
     state = _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
     saved_s = time.monotonic()
     while state.step < training.steps:
@@ -139,7 +141,8 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
             tell(state.step, {})
     _write(kept, state, spec)
     if whole := state.step == training.steps:
-        write_bundle(folder, state.averaged, examples, training.name, training.seed)
+        source = source_of(examples.meta, training.seed, begun)
+        write_bundle(folder, state.averaged, examples, training.name, source)
     return whole
 
 

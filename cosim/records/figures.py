@@ -13,6 +13,7 @@ import msgspec
 from cosim.core.clock import Clock
 from cosim.core.errors import unwritable
 from cosim.core.journal import happened
+from cosim.core.telling import milliseconds
 from cosim.core.whole_file import write_whole
 from cosim.records.record import Record
 from cosim.records.run_folder import read_records
@@ -23,7 +24,8 @@ _FILE = "figures.json"
 class Figures(msgspec.Struct, frozen=True, kw_only=True):
     """Of one go of a run. began: UTC; simulated_s: of all episodes; setup_s, driving_s: seconds of its processes, until
     the first observation and from there on; retried: episodes that were begun again; given_up: after the last attempt.
-    answer_ms: what the policy took for an answer, the median of the episodes' medians; None where that is not known.
+    answer_ms: how long episodes waited for an answer of the policy, wherever it was asked, the median of their medians;
+    None where that is not known.
     """
 
     began: str
@@ -47,7 +49,7 @@ class Figures(msgspec.Struct, frozen=True, kw_only=True):
             f"{self.episodes} episodes in {self.wall_s:.0f} s: {self.episodes_per_hour:,.0f} an hour, "
             f"{self.times_real:.1f} x real time; processes were busy for {busy_s:.0f} s{setup}; "
             f"{self.retried} retried, {self.given_up} given up"
-            + ("" if self.answer_ms is None else f"; the median answer took {self.answer_ms:.3g} ms")
+            + ("" if self.answer_ms is None else f"; the median answer took {milliseconds(self.answer_ms)}")
         )
 
 
@@ -90,7 +92,7 @@ def _figures_of(records: Collection[Record], began: str, wall_s: float, counts: 
 
 
 def median_answer_ms(records: Iterable[Record]) -> float | None:
-    """What the policy took for an answer, the median of the episodes' medians; None where none tells."""
+    """How long episodes waited for an answer of the policy, the median of their medians; None where none tells."""
     told = [record.clock["answer_ms"] for record in records if "answer_ms" in record.clock]
     return statistics.median(told) if told else None
 

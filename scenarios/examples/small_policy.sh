@@ -7,7 +7,7 @@
 # Works in pieces: stops after MINUTES (9 by default) and goes on where it was when called again, until it says "all done".
 # JOBS: processes that simulate (16). COSIM: the command (cosim). PYTHON: the one that has PyTorch, onnx and numpy, any from
 # 3.11 on (python3); it needs nothing else of this project but its folder. Made for 16 cores and a GPU; on two cores set
-# OMP_NUM_THREADS=1 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500, AGAIN: 200 a
+# OMP_NUM_THREADS=2 and BATCH=64 (256), and take fewer demonstrations by UNIT (1500) and EACH (500, AGAIN: 200 a
 # round), and fewer steps by STEPS (16000) and MORE (8000, of the fine-tuning). EVENTS: which are learned (all eight). MALLOC_...: memory of a step is
 # kept for the next one; giving it back and taking it again was a third of the time.
 set -uo pipefail
@@ -43,9 +43,9 @@ collect_again() { # round, learner, cities: what the expert would have done wher
   done
   step "pack-$1" $COSIM dataset pack "$W/demos/$1"/* -o "$W/$1.npz"
 }
-finetune() { # name, seed, data...
-  local name=$1 seed=$2; shift 2
-  learn "$name" "$@" "$W/unit.npz" --from "$W/nets/small" --seed "$seed" --steps "${MORE:-8000}" --rate 3e-4 --name small-reactive
+finetune() { # folder, what it is called, seed, data...
+  local folder=$1 called=$2 seed=$3; shift 3
+  learn "$folder" "$@" "$W/unit.npz" --from "$W/nets/small" --seed "$seed" --steps "${MORE:-8000}" --rate 3e-4 --name "$called"
 }
 score() { # name, policy, suite
   local more=(); [ -e "$W/runs/$3-$1/run.json" ] && more=(--resume)
@@ -61,10 +61,10 @@ step pack-unit $COSIM dataset pack "$W/demos/unit" -o "$W/unit.npz"
 step pack-events $COSIM dataset pack "$W"/demos/events/* -o "$W/events.npz"
 learn small "$W/unit.npz" --steps "${STEPS:-16000}"
 collect_again round1 "onnx:$W/nets/small" 940:980
-finetune halfway 0 "$W/events.npz" "$W/round1.npz"
+finetune halfway small-halfway 0 "$W/events.npz" "$W/round1.npz"
 collect_again round2 "onnx:$W/nets/halfway" 980:1020
 for seed in 0 1 2; do
-  finetune small-reactive-$seed $seed "$W/events.npz" "$W/round1.npz" "$W/round2.npz"
+  finetune small-reactive-$seed small-reactive $seed "$W/events.npz" "$W/round1.npz" "$W/round2.npz"
 done
 for suite in unit reactive long-horizon; do
   for net in small small-reactive-0 small-reactive-1 small-reactive-2; do score $net "onnx:$W/nets/$net" $suite; done

@@ -61,7 +61,7 @@ def serve_jobs(socket_descriptor: int, asked_descriptor: int) -> None:
     hello = decode_hello(wire.receive())
     _import_engines(say)
     timer = Asked(asked_descriptor)
-    drivers: Drivers | None = drivers_here(hello, timer, say)
+    drivers: DriversHere | None = drivers_here(hello, timer, say)
     say(Ready())
     while True:
         try:
@@ -103,7 +103,7 @@ def _import_engines(say: Hear) -> None:
 
 
 @dataclass(frozen=True)
-class Drivers:
+class DriversHere:
     """What drives here: the policy, or who asks the shared renderer's; and the learner where drives are collected."""
 
     policy: Driver
@@ -119,16 +119,16 @@ class Drivers:
             self.learner.close()
 
 
-def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Drivers:
+def drivers_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> DriversHere:
     """See `policy_here`; the learner is held against what it was for the run in the same way."""
     if hello.renderer is not None and hello.renderer.asks:
         driver: Driver = AskedElsewhere(hello.manifest, hello.source_hash, hello.renderer)
     else:
         driver = policy_here(hello, timer, say, again=again)
     if (learner := hello.learner) is None:
-        return Drivers(driver, None)
+        return DriversHere(driver, None)
     with _unable_told(say):
-        return Drivers(driver, _as_begun(load_policy(learner.policy, timer), learner, again))
+        return DriversHere(driver, _as_begun(load_policy(learner.policy, timer), learner, again))
 
 
 def policy_here(hello: Hello, timer: Asked, say: Hear, *, again: bool = False) -> Driver:

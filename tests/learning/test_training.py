@@ -26,7 +26,7 @@ from cosim.spec.robot import COURIER
 torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'sidewalk-cosim[train]'")
 onnx = pytest.importorskip("onnx")
 
-from cosim.learning.bundle import manifest_of  # noqa: E402
+from cosim.learning.bundle import bundle_facts, manifest_of, source_of  # noqa: E402
 from cosim.learning.examples import Examples, mirror  # noqa: E402
 from cosim.learning.graph import INPUTS, graph_of, parameters_of  # noqa: E402
 from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, new_parameters  # noqa: E402
@@ -122,7 +122,7 @@ def test_the_bundle_is_one_that_runs_take(learned: Path) -> None:
 def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
     """The bundle's camera has the size, the field of view, the place and the crop of that of the demonstrations."""
     camera = {"width": 160, "height": 120, "fov_deg": 60.0, "mount": "front", "crop": [0, 30, 160, 120], "depth": False}
-    manifest = msgspec.convert(manifest_of("small", street().meta | {"camera": camera}, 0), BundleManifest)
+    manifest = msgspec.convert(manifest_of("small", street().meta | {"camera": camera}, "told"), BundleManifest)
     assert manifest.camera.spec == CameraSpec(160, 120, 60.0, crop=(0, 30, 160, 120))
 
 
@@ -169,7 +169,7 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
     packed = replace(packed, frames=draws.integers(0, 256, packed.frames.shape, np.uint8), goal=goals)
     packed.save(tmp_path / "street.npz")
     trained_on = Examples([tmp_path / "street.npz"], 0, CPU).rows(np.arange(12))
-    manifest = msgspec.convert(manifest_of("small", packed.meta, 0), BundleManifest)
+    manifest = msgspec.convert(manifest_of("small", packed.meta, "told"), BundleManifest)
     ports = {name: TensorPort(name, np.dtype(np.float32), shape) for name, shape in INPUTS.items()}
     feeder = Feeder(manifest.inputs, ports, 0)
     for row, (rgb, speeds, goal) in enumerate(zip(packed.frames, packed.state, packed.goal, strict=True)):
@@ -181,14 +181,16 @@ def test_a_run_feeds_the_graph_what_it_was_trained_on(tmp_path: Path) -> None:
             np.testing.assert_allclose(tensor[0], getattr(trained_on, name)[row], atol=1e-6)
 
 
-def test_a_bundle_says_who_taught_it_and_who_drove(data: Path, tmp_path: Path) -> None:
-    """Of all files that it learned from: the experts, and the learners beside which they answered."""
+def test_a_bundle_says_who_taught_it_and_who_drove(learned: Path, data: Path, tmp_path: Path) -> None:
+    """Of all files that it learned from: the experts, and the learners beside which they answered; and which network it
+    began with."""
     again = street()
     replace(again, meta=again.meta | {"policy": ["orca-disturbed"], "learner": ["first"]}).save(tmp_path / "again.npz")
     meta = Examples([data, tmp_path / "again.npz"], 0, CPU).meta
-    assert manifest_of("small", street().meta, 0)["source"] == "cosim train, seed 0, on what orca drove"
+    assert source_of(street().meta, 0) == "cosim train, seed 0, on what orca drove"
     told = "cosim train, seed 1, on what orca, orca-disturbed drove, and would have done where first drove"
-    assert manifest_of("small", meta, 1)["source"] == told
+    assert source_of(meta, 1) == told
+    assert source_of(meta, 1, bundle_facts(learned)) == f"{told}; begun with small"
 
 
 def test_a_batch_hangs_on_seed_and_step_alone(data: Path) -> None:
@@ -235,11 +237,13 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
         ("graph", r"model\.onnx: no ONNX graph"),
         ("folder", r"holds a training: go on with it by --resume"),
         ("another", r"of another training: seed 0, not 1"),
+        ("other data", r"of another training: data [0-9a-f]{16}, not [0-9a-f]{16}:"),
+        ("other begin", r"of another training: from None, not [0-9a-f]{16}:"),
         ("device", r"device 'abacus' is not to be had: .* try cpu"),
         ("steps", r"--steps must be above 0, not 0"),
     ],
 )
-def test_what_cannot_be_trained_on_is_refused(data: Path, tmp_path: Path, wrong: str, told: str) -> None:
+def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_path: Path, wrong: str, told: str) -> None:
     """Each is one line that names file and field, what was found and what is wanted, and nothing is written."""
     packed, other, out = street(episodes=2), tmp_path / "other.npz", tmp_path / "out"
     if wrong == "size":
@@ -253,7 +257,8 @@ def test_what_cannot_be_trained_on_is_refused(data: Path, tmp_path: Path, wrong:
     packed.save(other)
     if wrong == "file":
         other.write_bytes(b"PK")
-    if wrong in ("folder", "another"):
+    again = wrong in ("another", "other data", "other begin")
+    if wrong == "folder" or again:
         train([data], out, replace(BRISK, minutes=1e-9), False, heard([]))
     if wrong == "graph":
         (tmp_path / "model.onnx").write_bytes(b"\xff\xff")
@@ -261,16 +266,18 @@ def test_what_cannot_be_trained_on_is_refused(data: Path, tmp_path: Path, wrong:
     with pytest.raises(CosimError, match=told):
         training = replace(
             BRISK,
-            begin=tmp_path if wrong in ("begin", "graph") else None,
+            begin=tmp_path if wrong in ("begin", "graph") else learned if wrong == "other begin" else None,
             device="abacus" if wrong == "device" else "cpu",
             seed=int(wrong == "another"),
             steps=0 if wrong == "steps" else BRISK.steps,
         )
         train(
-            [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data],
+            {"other data": [other]}.get(
+                wrong, [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data]
+            ),
             out,
             training,
-            wrong == "another",
+            again,
             heard([]),
         )
     assert sorted(out.rglob("*")) == before

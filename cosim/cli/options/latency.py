@@ -10,6 +10,7 @@ import msgspec
 from cosim.cli.terminal.consoles import err
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import UsageError
+from cosim.core.telling import milliseconds
 
 if TYPE_CHECKING:
     from cosim.spec.options import EpisodeOptions
@@ -50,8 +51,8 @@ def with_latency(
     with doing(f"measuring the latency of {policy} in {first.id}"):
         answer_ms, latency_ms = measured_latency(whole, first, policy, options, host or PolicyHost())
     err.print(
-        f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an answer took {answer_ms:.3g} "
-        "ms (median), and commands take effect at whole ticks of 50 ms.",
+        f"Latency {latency_ms:g} ms, that of every command of this run: in {first.id} an answer took "
+        f"{milliseconds(answer_ms)} (median), and commands take effect at whole ticks of 50 ms.",
         soft_wrap=True,
         highlight=False,
     )

@@ -15,6 +15,7 @@ from cosim.cli.options.recording import RERUN_HELP, write_rerun
 from cosim.cli.terminal.consoles import out
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import UsageError, unknown
+from cosim.core.telling import milliseconds
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -90,7 +91,7 @@ def print_episode(out: Console, record: Record) -> None:
     out.print(f"{record.scenario}: {record.status} {record.ended or ''} {record.reason}", soft_wrap=True, markup=False)
     if record.latency_ms or record.real_time:
         real = ", a median in whole ticks of 50 ms: replayed, never made again" if record.real_time else ""
-        took = "" if record.answer_ms is None else f"the policy took {record.answer_ms:.3g} ms for an answer (median); "
+        took = "" if record.answer_ms is None else f"an answer took {milliseconds(record.answer_ms)} (median); "
         out.print(f"  {took}commands took effect {record.latency_ms:g} ms after what they answer{real}", soft_wrap=True)
     for failure in record.failures:
         what = f" with {failure.other_kind} {failure.other}" if failure.other else ""

@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
+from cosim.core.telling import milliseconds
 from cosim.judge.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
 from cosim.records.results import not_to_be_quoted, summary_of
 from cosim.spec.scenario import Scenario, read_suite
@@ -160,8 +161,8 @@ def _latency_in_words(table: pd.DataFrame) -> str:
 
 
 def _median_and_range(of_episodes_ms: pd.Series[float]) -> str:
-    least, middle, most = (f"{of_episodes_ms.quantile(q):.3g}" for q in (0.0, 0.5, 1.0))
-    return f"{middle} ms ({least} to {most} ms)"
+    least, middle, most = (milliseconds(float(of_episodes_ms.quantile(q))) for q in (0.0, 0.5, 1.0))
+    return f"{middle} ({least.removesuffix(' ms')} to {most})"
 
 
 def print_delays(out: Console, table: pd.DataFrame) -> None:

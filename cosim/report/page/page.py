@@ -11,7 +11,7 @@ from typing import Final
 import msgspec
 import numpy as np
 
-from cosim.core.telling import duration
+from cosim.core.telling import duration, milliseconds
 from cosim.records.figures import median_answer_ms
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
@@ -226,7 +226,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "drawn by": spec.renderer,
         "goal": spec.goal_protocol,
         "odometry": spec.odometry,
-        "an answer took": "not told" if took_ms is None else f"{took_ms:.3g} ms, the median",
+        "an answer took": "not told" if took_ms is None else f"{milliseconds(took_ms)}, the median",
         "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
         "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
         "waypoints": spec.waypoints.in_words,
