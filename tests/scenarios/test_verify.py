@@ -46,6 +46,13 @@ def test_what_is_shipped_is_of_the_shipped_suites(shipped: Given) -> None:
     assert writable(shipped, [case.id for case in cases]) is shipped
 
 
+def test_what_is_shipped_was_made_by_the_sources_as_they_are(shipped: Given) -> None:
+    """Else a difference is blamed on a source that is as it was shipped."""
+    here = room_hashes()
+    other = [room for room in {*here, *shipped.sources} if here.get(room) != shipped.sources.get(room)]
+    assert not other, "the source has changed: see that `cosim verify` finds the same bits, then `cosim verify --write`"
+
+
 def told(shipped: Given, here: Given) -> tuple[list[str], str]:
     """What differs, and all that is said of it."""
     wrong = [one for one in findings(shipped, here) if not one.fine]
