@@ -92,7 +92,7 @@ def packed_digest(path: Path) -> str:
         with zipfile.ZipFile(path) as held:
             told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
     except (OSError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`") from error
+        raise _none_in(path, error) from error
     return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
 
 
@@ -105,5 +105,9 @@ def read_packed(path: Path) -> Packed:
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
     except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
-        raise RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`") from error
+        raise _none_in(path, error) from error
     return Packed(**arrays, meta=meta)
+
+
+def _none_in(path: Path, error: Exception) -> RunError:
+    return RunError(f"{path}: no packed demonstrations: {error}: make it with `cosim dataset pack`")

@@ -25,8 +25,8 @@ def duration(seconds: float) -> str:
 def milliseconds(ms: float) -> str:
     """A short time in words, to three figures: 0.43 ms, 70.3 ms, 1,235 ms.
 
-    >>> milliseconds(70.345), milliseconds(1234.5)
-    ('70.3 ms', '1,234 ms')
+    >>> milliseconds(70.345), milliseconds(1234.6)
+    ('70.3 ms', '1,235 ms')
     """
     return f"{ms:.3g} ms" if abs(ms) < 999.5 else f"{ms:,.0f} ms"
 

@@ -263,6 +263,8 @@ def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_pat
     if wrong == "graph":
         (tmp_path / "model.onnx").write_bytes(b"\xff\xff")
     before = sorted(out.rglob("*"))
+    files = [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data]
+    files = [other] if wrong == "other data" else files
     with pytest.raises(CosimError, match=told):
         training = replace(
             BRISK,
@@ -272,9 +274,7 @@ def test_what_cannot_be_trained_on_is_refused(learned: Path, data: Path, tmp_pat
             steps=0 if wrong == "steps" else BRISK.steps,
         )
         train(
-            {"other data": [other]}.get(
-                wrong, [data, other] if wrong in ("size", "goal", "turn", "rate", "file") else [data]
-            ),
+            files,
             out,
             training,
             again,
