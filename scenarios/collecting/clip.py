@@ -1,8 +1,9 @@
 """Clips: the pictures of an episode as H.264, each encoded by itself; joined to one .mp4 without encoding them anew.
 
 The same pictures give the same bytes, also back: one thread, no date, no B-frames, so that a clip begins and ends with
-itself, and colours are converted here, in whole numbers (BT.601, as players take it): the library rounds otherwise from
-time to time, as its buffers lie in memory.
+itself; colours are converted here, in whole numbers (BT.601, as players take it): the library rounds otherwise from
+time to time, as its buffers lie in memory; and the encoder takes none of the short cuts that some processors offer: it
+decides otherwise with them, and with those of AVX-512 it does so from one call to the next.
 """
 
 from __future__ import annotations
@@ -23,7 +24,10 @@ from cosim.core.errors import RunError
 
 CODEC: Final = "h264"
 PIXELS: Final = "yuv420p"
-_OPTIONS: Final = {"crf": "18", "preset": "veryfast", "bf": "0", "g": "10", "threads": "1", "flags": "+bitexact"}
+_OPTIONS: Final = {
+    "crf": "18", "preset": "veryfast", "bf": "0", "g": "10", "threads": "1", "flags": "+bitexact",
+    "x264-params": "cpu-independent=1",
+}  # fmt: skip
 _MUXED: Final = {"fflags": "+bitexact"}
 
 

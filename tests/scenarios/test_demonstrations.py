@@ -21,7 +21,7 @@ from cosim.records.record import begun
 from cosim.spec.collecting import COLLECTED_GOALS, Collecting, demonstrating
 from cosim.spec.goal import GOALS, goal_called
 from cosim.spec.robot import COURIER
-from scenarios.collecting.clip import Clip, _planes_of, _rgb_of, join_clips, pictures_of
+from scenarios.collecting.clip import _OPTIONS, Clip, _planes_of, _rgb_of, join_clips, pictures_of
 from scenarios.collecting.demonstration import Demonstration, glimpse, waypoints_ahead
 from scenarios.collecting.demonstrator import _Bursts
 from scenarios.collecting.fresh import fresh, fresh_cities
@@ -107,6 +107,24 @@ def test_a_data_set_has_the_same_bytes_whenever_it_is_written(data_set: Path, tm
     assert len(files) == 7
     assert files == sorted(path.relative_to(again) for path in again.rglob("*") if path.is_file())
     assert all((data_set / name).read_bytes() == (again / name).read_bytes() for name in files)
+
+
+def test_a_clip_is_the_same_whatever_instructions_the_processor_has(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Restricted to those of older processors, or to none of the fast ones, the encoder writes the same bytes."""
+    rng, known = np.random.default_rng(0), known_pictures(5, 12)
+    pictures = [cv2.add(one, cv2.blur(rng.integers(0, 90, one.shape, np.uint8), (3, 3))) for one in known]
+
+    def clip_of(params: str) -> bytes:
+        monkeypatch.setitem(_OPTIONS, "x264-params", params)
+        clip = Clip((64, 48), FPS)
+        for one in pictures:
+            clip.add(one)
+        return clip.finished()
+
+    asked = _OPTIONS["x264-params"]
+    made = {clip_of(asked), *(clip_of(f"{asked}:asm={instructions}") for instructions in ("AVX2", "SSE2", "0"))}
+    assert len(made) == 1
+    assert clip_of("asm=0:subme=0") not in made
 
 
 def test_a_clip_is_the_same_wherever_its_pictures_lie_in_memory() -> None:
