@@ -159,7 +159,10 @@ class _Builder:
         return self._op("BatchNormalization", x, *numbers, epsilon=1e-5)
 
     def _act(self, x: str, name: str) -> str:
-        return self._op("PRelu", x, self._constant(self._take(f"{name}.weight").reshape(-1, 1, 1)))
+        """PReLU in four operators: the same bits as the one called so, which takes the runtime twice as long."""
+        above = self._op("Relu", x)
+        slope = self._constant(self._take(f"{name}.weight").reshape(-1, 1, 1))
+        return self._op("Add", above, self._op("Mul", self._op("Sub", x, above), slope))
 
     def _halved(self, x: str) -> str:
         return self._op("AveragePool", x, kernel_shape=[3, 3], strides=[2, 2], pads=[1, 1, 1, 1], count_include_pad=1)
