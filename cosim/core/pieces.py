@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
@@ -24,7 +25,10 @@ from cosim.core.baked import MAKING, Arrays, cache_folder, forget_unused, mark_u
 _SEAL_BYTES: Final = 32
 _ALIGNED: Final = 16
 _OFTEN: Final = 1000
-"""After so many that were written, what is no longer used is taken away once more."""
+"""After so many that a process has written, it takes away once more what is no longer used: to look through a full
+cache takes as long as to make some ten of them."""
+_written: Final = Counter[Path]()
+"""How many this process has written to the folder of a kind."""
 
 _Table = list[tuple[str, bytes, tuple[int, ...], int]]
 """Name, dtype as JSON, shape and start of each array of a file."""
@@ -36,7 +40,6 @@ class Pieces:
 
     def __init__(self, kind: str, made_of: str) -> None:
         self._folder = cache_folder() / kind / made_of if made_of else None
-        self._written = 0
         if self._folder is not None:
             mark_used(self._folder)
 
@@ -57,9 +60,9 @@ class Pieces:
     def _keep(self, path: Path, arrays: Arrays) -> None:
         """In one move: several processes may make the same at once, and the last wins."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        if self._written % _OFTEN == 0:
+        if _written[path.parent.parent] % _OFTEN == 0:
             forget_unused(path.parent)
-        self._written += 1
+        _written[path.parent.parent] += 1
         handle, name = tempfile.mkstemp(prefix=MAKING, dir=path.parent.parent)
         making = Path(name)
         try:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from cosim.core import baked as kept
+from cosim.core import pieces
 from cosim.core.baked import Arrays, baked
 from cosim.core.pieces import Pieces, _read
 from tests.conftest import PATIENCE_S
@@ -148,6 +149,7 @@ def test_who_is_killed_while_making_leaves_nothing_wrong(cache: Path) -> None:
 
 def test_what_nobody_uses_is_forgotten(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unused for a month, beyond the room there is, or half made by a process long dead: taken away, the rest kept."""
+    monkeypatch.setattr(pieces, "_OFTEN", 1)
     make, now = Maker(), time.time()
     for name, unused_s in (("month", 31 * 86400), ("long", 5000), ("lately", 4000), ("opened", 31 * 86400)):
         Pieces("tiles", name).get("0_0", make)
@@ -160,6 +162,16 @@ def test_what_nobody_uses_is_forgotten(cache: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(kept, "_MOST_BYTES", 2 * size)
     Pieces("tiles", "new").get("0_0", make)
     assert sorted(path.name for path in (cache / "tiles").iterdir()) == ["lately", "new", "opened"]
+
+
+def test_a_process_looks_for_what_nobody_uses_once_in_so_many_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many things they are of: to look through a full cache takes long."""
+    looked: list[Path] = []
+    monkeypatch.setattr(pieces, "forget_unused", looked.append)
+    monkeypatch.setattr(pieces, "_OFTEN", 4)
+    for name in "abcdef":
+        Pieces("tiles", name).get("0_0", Maker())
+    assert [folder.name for folder in looked] == ["a", "e"]
 
 
 def test_baked_arrays_that_nobody_uses_are_forgotten(cache: Path) -> None:
