@@ -3,8 +3,6 @@
 
 PYTHON ?= python3.11
 JOBS ?= 2
-# Of tests: they wait for processes and sockets a fifth of the time.
-WORKERS ?= 3
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
@@ -22,8 +20,8 @@ run: .venv/run.stamp | machine
 	@$(BIN)/cosim run long-horizon --policy orca --episodes 2 --jobs $(JOBS)
 
 test: .venv/dev.stamp | machine
-	@$(BIN)/python -m pytest -m "not engine" -n $(WORKERS) --dist loadfile
-	@$(BIN)/python -m pytest -m engine -n $(WORKERS) --dist loadfile
+	@$(BIN)/python -m pytest -m "not engine" -n $(JOBS) --dist loadfile
+	@$(BIN)/python -m pytest -m engine -n $(JOBS) --dist loadfile
 
 check: .venv/dev.stamp | machine
 	@$(BIN)/ruff check .
