@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from types import MappingProxyType
 
 import msgspec
 
 from cosim.core.errors import UsageError, unknown
-from cosim.spec.scenario import Scenario, Suite, read_suite
+from cosim.spec.scenario import Suite, read_suite
 from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent / "suites"
@@ -80,34 +80,3 @@ def with_robot(whole: Suite, robot: str) -> Suite:
     if scenarios == whole.scenarios:
         return whole
     return msgspec.structs.replace(whole, scenarios=scenarios, version=f"{whole.version}-{robot}")
-
-
-def scenarios_chosen(
-    whole: Suite,
-    ids: Sequence[str] = (),
-    episodes: int | None = None,
-    kinds: Sequence[str] = (),
-    split: str | None = None,
-) -> tuple[Scenario, ...]:
-    """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.
-
-    split: those of val or of test alone.
-
-    Raises UsageError with the valid names.
-    """
-    by_id = {scenario.id: scenario for scenario in whole.scenarios}
-    for scenario_id in ids:
-        if scenario_id not in by_id:
-            raise unknown("scenario", scenario_id, by_id)
-    picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
-    there = {event.kind: None for scenario in picked for event in scenario.events}
-    for kind in kinds:
-        if kind not in there:
-            raise unknown("event", kind, there)
-    if kinds:
-        picked = [s for s in picked if any(event.kind in kinds for event in s.events)]
-    if split is not None:
-        picked = [s for s in picked if s.split == split]
-        if not picked:
-            raise UsageError(f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen")
-    return tuple(picked[:episodes])

@@ -1,18 +1,16 @@
-"""A policy by name: one that ships with the project, the user's own as `package.module:Class`, or `onnx:FOLDER`."""
+"""Load a policy by name: a shipped one, `path/to/file.py:Class`, `package.module:Class`, or `onnx:FOLDER`."""
 
 from __future__ import annotations
 
 import hashlib
-import importlib
 import inspect
 import math
 import os
 import signal
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, cast
 
 import msgspec
 
@@ -22,6 +20,7 @@ from cosim.episode.driver import Driver, Timer, told_of
 from cosim.episode.given import with_goal
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
+from cosim.policies.own_module import importable, policy_class, policy_module, remedy_for_missing
 from cosim.policies.shipped import shipped_bundles
 
 _MOST_PX = 4096
@@ -33,6 +32,9 @@ ONNX_SCHEME = "onnx:"
 REMOTE_SCHEME = "zenoh:"
 """Before the name of a policy that `cosim serve` or `bridge/policy_server.py` serves."""
 
+OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}FOLDER")
+"""How policies are named that are not listed."""
+
 
 def load_policy(name: str, timer: Timer | None = None) -> Driver:
     """A new policy, its manifest read. Raises UsageError when the name means nothing or the class is no policy.
@@ -42,6 +44,7 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
     >>> load_policy("route").manifest.name
     'route'
     """
+    name = importable(name)
     if name.startswith(ONNX_SCHEME):
         return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser()), timer)
     if name.startswith(REMOTE_SCHEME):
@@ -55,7 +58,7 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
             return _by_networks(name, _bundle(bundles[name]), timer)
         if name == FOLLOW:
             return _by_networks(name, _follow, timer)
-        raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, "package.module:Class", f"{ONNX_SCHEME}FOLDER"])
+        raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, *OTHER_NAMES])
     process, home = os.getpid(), Path.cwd()
     if timer is not None:
         timer.starts("loading", 0)
@@ -129,18 +132,16 @@ def source_hash(policy: Policy) -> str:
 
 def _made(name: str) -> Policy:
     """The object that `package.module:Class` makes."""
-    module_name, _, class_name = name.partition(":")
-    here = str(Path.cwd())
-    if here not in sys.path:
-        sys.path.insert(0, here)
-    with _in_words(f"policy '{name}': module '{module_name}' cannot be imported:"):
-        module = importlib.import_module(module_name)
-    if not hasattr(module, class_name):
-        classes = sorted(k for k, v in vars(module).items() if isinstance(v, type) and v.__module__ == module.__name__)
-        raise unknown(f"class in module '{module_name}'", class_name, classes)
+    try:
+        with _in_words(f"policy '{name}': module '{name.partition(':')[0]}' cannot be imported:"):
+            module, class_name = policy_module(name)
+    except UsageError as error:
+        if not isinstance(error.__cause__, ModuleNotFoundError):
+            raise
+        raise UsageError(f"{error}. {remedy_for_missing(name, error.__cause__.name or '')}") from error
+    make = policy_class(module, class_name)
     with _in_words(f"policy '{name}' cannot be made:"):
-        policy: Policy = getattr(module, class_name)()
-    return policy
+        return cast(Policy, make())
 
 
 def _checked(name: str, policy: Policy) -> Manifest:

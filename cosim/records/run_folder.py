@@ -78,15 +78,16 @@ class RunFolder:
         return cls(path, spec, suite)
 
     @classmethod
-    def resume(cls, path: Path, spec: RunSpec) -> RunFolder:
-        """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run."""
+    def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
+        """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run.
+        whole: the suite that its scenarios are of."""
         found = read_spec(path)
         if found.policy == spec.policy and found.policy_source != spec.policy_source:
             raise RunError(
                 f"{path} is of another run: the source of policy '{spec.policy}' was edited since it began. Resume "
                 "with the source as it was, or choose another --out."
             )
-        if (apart := found.apart(spec)) is not None:
+        if (apart := found.apart(spec, whole=whole)) is not None:
             raise RunError(
                 f"{path} is of another run: its {apart.field} is {apart.mine}, now asked for is {apart.theirs}. "
                 f"Resume with the same command, or choose another --out.{apart.hint}"

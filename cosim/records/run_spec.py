@@ -13,6 +13,8 @@ from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
 from cosim.spec.policy_host import PolicyRuns
+from cosim.spec.scenario import Suite
+from cosim.spec.selection import selection_in_words
 
 _T = TypeVar("_T")
 SAME = (
@@ -24,6 +26,11 @@ SAME = (
 _ARITHMETIC = (
     " Of two machines whose arithmetic is apart the processors or C libraries round differently: episodes of one are "
     "not those of the other to the bit."
+)
+
+_OF_SUITE = ("suite_version", "suite_hash")
+_OTHER_SUITE = (
+    " The suite was edited; or --robot, --crowd and the like differ; or, with --map, --seed, --episodes or --event do."
 )
 
 
@@ -97,18 +104,35 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     shard: Shard | None = None
     schema: int = 1
 
-    def apart(self, other: RunSpec, but: str = "") -> Apart | None:
-        """The first field in which another run is not the same; None where it is. but: a field that may differ."""
+    def apart(self, other: RunSpec, but: str = "", whole: Suite | None = None) -> Apart | None:
+        """The first field in which another run is not the same; None where it is. but: a field that may differ. whole:
+        the suite of both, for words about which of its scenarios they have."""
         for field in SAME:
             mine, theirs = getattr(self, field), getattr(other, field)
             if mine == theirs or field == but:
                 continue
+            if field == "scenarios":
+                return _chosen_apart(self.scenarios, other.scenarios, whole)
             changed: set[str] = set()
             if isinstance(mine, dict) and isinstance(theirs, dict):
                 changed = {name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name)}
                 mine, theirs = ({n: of.get(n) for n in sorted(changed)} for of in (mine, theirs))
-            return Apart(field, _brief(mine), _brief(theirs), _ARITHMETIC if "arithmetic" in changed else "")
+            hint = _ARITHMETIC if "arithmetic" in changed else _OTHER_SUITE if field in _OF_SUITE else ""
+            return Apart(field, _brief(mine), _brief(theirs), hint)
         return None
+
+
+def _chosen_apart(mine: Sequence[str], theirs: Sequence[str], whole: Suite | None) -> Apart:
+    """How many scenarios two runs of a suite have, and by which options, or else one that only one of them has."""
+    if whole is None:
+        return Apart("choice of scenarios", _counted(mine, theirs), _counted(theirs, mine), "")
+    return Apart("choice of scenarios", selection_in_words(whole, mine), selection_in_words(whole, theirs), "")
+
+
+def _counted(ids: Sequence[str], others: Sequence[str]) -> str:
+    """How many scenarios, and one of them that is not among the others."""
+    more = next((f", with {name}" for name in ids if name not in others), "")
+    return f"{len(ids)}{more}"
 
 
 def _brief(value: object) -> str:

@@ -14,9 +14,10 @@ from typing import Final
 import numpy as np
 
 from cosim.spec.scenario import City, CityMap, Scenario, Suite, content_hash
+from cosim.spec.selection import STATIC
 from scenarios.builders.daylight import FOG_M, LOWEST_SUN_RAD, sun_rises_rad
 from scenarios.builders.proofs import Proofs, proofs_path
-from scenarios.builders.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES, STATIC
+from scenarios.builders.recipes import ALL_ROUTES_M, LONG_WAY, RECIPES
 from scenarios.builders.unit import STRUCTURES, TURN_RAD, WAY_M, turn_rad
 from scenarios.events import EVENT_KINDS
 from sumo_nets.maps.wheel_places import WHEEL_PLACES

@@ -15,6 +15,7 @@ import numpy as np
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CityMap, Place, Scenario, Split
+from cosim.spec.selection import STATIC
 from scenarios.builders.daylight import drawn_daylight
 from scenarios.builders.drawing import thinned
 from scenarios.builders.long_horizon import build_long_horizon
@@ -25,8 +26,6 @@ from scenarios.execution.places import place
 from sumo_nets.city.seeds import SEEDS, TEST_SEEDS
 from sumo_nets.maps.wheel_places import WHEEL_PLACES
 
-STATIC: Final = "static"
-"""The reference: the same place and way, and nobody there."""
 LONG_WAY: Final = "route"
 TEST_CROPS: Final = ("braunschweig-2", "wildau-1")
 _SMALL_CROPS: Final = ("ingolstadt-1", "braunschweig-1")

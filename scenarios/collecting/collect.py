@@ -26,6 +26,7 @@ from cosim.core.telling import Tell, untold
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
 from cosim.episode.driver import Driver
+from cosim.policies.own_module import importable
 from cosim.records.record import Record
 from cosim.records.run_folder import DEMONSTRATION, RunFolder
 from cosim.spec.collecting import Collecting
@@ -135,6 +136,8 @@ def collect(
     MachineError for what the machine lacks.
     """
     check_parquet()
+    policy = importable(policy)
+    collecting = msgspec.structs.replace(collecting, learner=importable(collecting.learner))
     options = msgspec.structs.replace(options, collecting=collecting, seed=options.seed or 0)
     learner = learner_of(collecting)
     demonstrator = Demonstrator(expert, collecting, options.goal, learner)

@@ -17,7 +17,8 @@ import msgspec
 from cosim.core.errors import CosimError, MachineError, UsageError, unknown
 from cosim.core.telling import Tell, untold
 from cosim.spec.scenario import City, Scenario
-from scenarios.builders.recipes import STATIC, Slot, candidate, repeated
+from cosim.spec.selection import STATIC
+from scenarios.builders.recipes import Slot, candidate, repeated
 from scenarios.builders.unit import STRUCTURES
 from scenarios.events import EVENT_KINDS
 from sumo_nets.city.seeds import SEEDS

@@ -20,6 +20,7 @@ from cosim.episode.camera_rules import check_camera
 from cosim.episode.driver import Driver
 from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
+from cosim.policies.own_module import importable
 from cosim.records.record import METRIC_SCHEMA, NO_RENDERER
 from cosim.records.run_folder import RunFolder, read_spec
 from cosim.records.run_spec import RunSpec, Shard
@@ -28,11 +29,12 @@ from cosim.spec.policy_host import PolicyHost
 from cosim.spec.pseudonym import drawn_seed
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Suite
+from cosim.spec.selection import scenarios_chosen
 from physics.cameras.choice import camera_of_choice as chosen_camera
 from physics.cameras.choice import renderer_of
 from physics.robots import hash_of_robot
 from scenarios.builders.fits import check_places
-from scenarios.catalog import load_suite, scenarios_chosen, with_robot
+from scenarios.catalog import load_suite, with_robot
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hear, Hello
 from scenarios.execution.pool import run_all
@@ -66,7 +68,7 @@ def run(
     """Run a suite with a policy; one row per episode, sorted by scenario, as in `results.csv`.
 
     suite: one that was loaded, or a name or path as for `load_suite`. policy: an object, which drives in this process,
-    one episode after another; or a name, as "orca" or "package.module:Class", which drives in `jobs` processes (one)
+    one episode after another; or a name, as "orca" or "my.py:Class", which drives in `jobs` processes (one)
     that survive whatever it does; or, with `on` ("ray", "auto", "ray://HOST:10001"), in those of a Ray cluster, as many
     as it has CPUs. episodes, scenarios, events: run only the first so many, these ids, these kinds of events. shard:
     only a part of that, as "1/4", of a run with a seed: `cosim merge` makes one of all.
@@ -86,7 +88,7 @@ def run(
     asked = next((words for words, is_asked in needs.items() if is_asked), "shared_renderer=True" * shared_renderer)
     if asked and not isinstance(policy, str):
         raise UsageError(
-            f"{asked} needs a policy by its name, such as 'package.module:Class': "
+            f"{asked} needs a policy by its name, such as 'my.py:Class': "
             "every process makes one of its own; an object drives in this process alone"
         )
     if on:
@@ -156,6 +158,7 @@ def planned_run(
 ) -> PlannedRun:
     """A run, once its policy is loaded and its seed drawn; its places have not been looked at. shard: "1/4"; resumed:
     the folder of the run that it goes on with. Raises UsageError, MachineError."""
+    policy = importable(policy) if isinstance(policy, str) else policy
     part = Shard.called(shard, len(of_run)) if shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError("--shard needs --seed: shards are of one run, which has one seed: give the same to each")
@@ -173,7 +176,9 @@ def planned_run(
 @contextmanager
 def held_run(plan: PlannedRun, folder: Path, *, resume: bool) -> Iterator[HeldRun]:
     """The run in its folder, begun there, or to be gone on with. Raises RunError for a folder of another run."""
-    held = RunFolder.resume(folder, plan.spec) if resume else RunFolder.create(folder, plan.spec, plan.whole)
+    held = (
+        RunFolder.resume(folder, plan.spec, plan.whole) if resume else RunFolder.create(folder, plan.spec, plan.whole)
+    )
     hello = Hello(plan.policy, plan.driver.manifest, plan.driver.source_hash, host=plan.host)
     with held:
         done = held.finished()

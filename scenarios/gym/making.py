@@ -14,7 +14,8 @@ from cosim.episode.ports import Manifest
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Split, Suite
-from scenarios.catalog import load_suite, scenarios_chosen, with_robot
+from cosim.spec.selection import scenarios_chosen
+from scenarios.catalog import load_suite, with_robot
 from scenarios.gym.reward import Reward, usual_reward
 
 if TYPE_CHECKING:

@@ -20,6 +20,7 @@ import msgspec
 
 from bridge.codec import decode, encode
 from cosim.core.errors import MachineError, UsageError
+from cosim.policies.own_module import importable
 from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import Place
 from scenarios.execution.asked import Question
@@ -293,6 +294,7 @@ class _Told(msgspec.Struct):
 
 def _own_module(policy: str) -> str:
     """The package, or the file, of a policy that is not installed; "" for all others."""
+    policy = importable(policy)
     name = policy.partition(":")[0].partition(".")[0] if ":" in policy else ""
     spec = importlib.util.find_spec(name) if name else None
     if spec is None:

@@ -6,6 +6,7 @@ from cosim.core.errors import UsageError
 from cosim.episode.driver import Driver, Timer
 from cosim.episode.ports import Manifest
 from cosim.policies.load import REMOTE_SCHEME, load_policy
+from cosim.policies.own_module import importable
 from cosim.spec.policy_host import PolicyHost
 from scenarios.serving.isolated import isolated_driver
 
@@ -17,6 +18,7 @@ def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expec
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
     """
+    name = importable(name)
     if name.startswith(REMOTE_SCHEME):
         from scenarios.serving.remote import remote_driver
 

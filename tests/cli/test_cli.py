@@ -175,6 +175,8 @@ def test_a_run_prints_its_table_and_leaves_its_folder(desk: Path, cosim: Cosim, 
     assert (
         shown.returncode == 0 and "t-2" in shown.stdout and "scheduled 3, scored 3, of these crashed 0" in shown.stdout
     )
+    other = cosim("run", "tiny.json", "--policy", "straight", "--episodes", "2", "--out", "whole", "--resume", cwd=desk)
+    assert other.returncode == 2 and "is 3 of 3 (all), now asked for is 2 of 3 (--episodes 2)." in other.stderr
     again = cosim("score", "whole", cwd=desk)
     assert again.returncode == 0 and "3 episodes" in again.stdout and "equal to the bit" in again.stdout
     one = cosim("show", "whole", "--episode", "t-0", "-o", "above.png", cwd=desk)

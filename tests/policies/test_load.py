@@ -13,6 +13,7 @@ from cosim.core.errors import UsageError
 from cosim.episode.driver import PolicyCall
 from cosim.policies import POLICIES
 from cosim.policies.load import load_policy
+from cosim.policies.own_module import importable
 
 GOOD = """
 from cosim.episode.ports import CameraSpec, Manifest, WaypointRule
@@ -92,8 +93,10 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     yield tmp_path
-    for name in ("mine", "base"):
-        sys.modules.pop(name, None)
+    for name in [*sys.modules]:
+        source = getattr(sys.modules[name], "__file__", None)
+        if source and Path(source).is_relative_to(tmp_path):
+            del sys.modules[name]
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -148,6 +151,91 @@ def test_an_edited_policy_has_another_hash(desk: Path) -> None:
     (desk / "further").mkdir()
     os.chdir(desk / "further")
     assert load_policy("mine:Mine").source_hash == hash_of(child, "class Base: kept = 1")
+
+
+def lay_out(desk: Path) -> None:
+    """A policy in this folder, one in another beside what it imports, one in a package that imports its own parts."""
+    (desk / "mine.py").write_text(GOOD.format(fields=""))
+    (desk / "deeper").mkdir()
+    (desk / "deeper/alone.py").write_text("import sibling" + GOOD.format(fields=""))
+    (desk / "deeper/sibling.py").touch()
+    (desk / "whole/inner").mkdir(parents=True)
+    for part in ("whole/__init__.py", "whole/inner/__init__.py", "whole/part.py"):
+        (desk / part).touch()
+    (desk / "whole/inner/driving.py").write_text("from ..part import __name__ as part" + GOOD.format(fields=""))
+
+
+@pytest.mark.parametrize(
+    ("spelled", "imported"),
+    [
+        ("mine.py:Mine", "mine:Mine"),
+        ("./mine.py:Mine", "mine:Mine"),
+        ("{desk}/mine.py:Mine", "mine:Mine"),
+        ("deeper/../mine.py:Mine", "mine:Mine"),
+        ("deeper/alone.py:Mine", "alone:Mine"),
+        ("{desk}/deeper/alone.py:Mine", "alone:Mine"),
+        ("whole/inner/driving.py:Mine", "whole.inner.driving:Mine"),
+    ],
+)
+def test_a_policy_is_named_by_its_file_or_its_module(desk: Path, spelled: str, imported: str) -> None:
+    """Both spellings load the same class with the same source hash; siblings and relative imports work."""
+    lay_out(desk)
+    spelled = spelled.format(desk=desk)
+    assert importable(spelled) == imported and importable(imported) == imported
+    by_file, by_module = load_policy(spelled), load_policy(imported)
+    assert type(by_file.policy) is type(by_module.policy) and by_file.source_hash == by_module.source_hash != ""
+
+
+def test_a_name_that_is_no_file_is_left_as_it_is() -> None:
+    """Shipped names, networks, served policies and modules."""
+    for name in ("orca", "onnx:my_network", "onnx:a/b.onnx", "zenoh:mine", "my_robot.policy:Mine", ""):
+        assert importable(name) == name
+
+
+MISNAMED = {
+    "no such file": (
+        "min.py:Mine",
+        "there is no file {desk}/min.py. Python files in {desk}: mine.py. Did you mean",
+    ),
+    "no such folder": ("lost/mine.py:Mine", "there is no file {desk}/lost/mine.py. Python files in {desk}/lost: none."),
+    "no class": ("mine.py", "names a file and no class: write mine.py:Mine. Classes in it: Mine"),
+    "another class": ("mine.py:Yours", "unknown class in module 'mine' 'Yours'. Valid choices: Mine."),
+    "a module of Python": ("random.py:Mine", "there is another module 'random', which comes with Python: rename"),
+    "a dot in its name": ("mine.v2.py:Mine", "'mine.v2' has a dot, and a module's name has none: rename it"),
+    "two of one name": ("deeper/mine.py:Mine", "there is another module 'mine', loaded from {desk}/mine.py: rename"),
+}
+
+
+@pytest.mark.parametrize("name", MISNAMED)
+def test_a_file_that_cannot_be_loaded_is_named_with_the_remedy(desk: Path, name: str) -> None:
+    """The file, the choices there, and what to do instead."""
+    lay_out(desk)
+    load_policy("mine:Mine")
+    spelled, told = MISNAMED[name]
+    if not name.startswith("no"):
+        (desk / spelled.partition(":")[0]).write_text(GOOD.format(fields=""))
+    with pytest.raises(UsageError) as caught:
+        load_policy(spelled)
+    assert told.format(desk=desk) in str(caught.value)
+
+
+def test_a_module_that_is_not_found_says_where_it_was_searched(desk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All folders of the path but Python's own are listed, with the file of that name farther down."""
+    monkeypatch.syspath_prepend(desk / "libraries")
+    lay_out(desk)
+    with pytest.raises(UsageError) as caught:
+        load_policy("alone:Mine")
+    said = str(caught.value)
+    assert f"{desk / 'libraries'}, {desk}" in said.partition("Searched: ")[2] and "lib-dynload" not in said
+    assert said.endswith(
+        "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or name the file: "
+        "deeper/alone.py:Mine"
+    )
+    (desk / "mine.py").write_text("import not_installed")
+    with pytest.raises(UsageError) as caught:
+        load_policy("mine.py:Mine")
+    assert f"Searched: {desk}" in str(caught.value)
+    assert f"Install 'not_installed' for {sys.executable}, or add its folder to PYTHONPATH" in str(caught.value)
 
 
 def test_every_policy_of_ours_has_its_own_hash() -> None:

@@ -136,7 +136,7 @@ def test_different_episodes_of_a_scenario_are_a_conflict(tmp_path: Path, cosim: 
     [
         ("seed", 8, "its seed is 8, there it is 0"),
         ("policy", "q", "its policy is q, there it is p"),
-        ("scenarios", SPEC.scenarios[:5], "its scenarios is"),
+        ("scenarios", SPEC.scenarios[:5], "its choice of scenarios is 5, there it is 7, with s-005"),
         ("versions", {"numpy": "3", "arithmetic": "1f"}, "{'numpy': '3'}, there it is {'numpy': '2'}"),
         ("versions", {"numpy": "2", "arithmetic": "2e"}, "the processors or C libraries round differently"),
     ],

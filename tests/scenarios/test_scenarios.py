@@ -25,12 +25,13 @@ from cosim.policies import POLICIES
 from cosim.spec.events import Event, EventQuery
 from cosim.spec.robot import ROBOTS, Robot
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
+from cosim.spec.selection import scenarios_chosen
 from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
 from scenarios.builders.drawing import thinned
 from scenarios.builders.long_horizon import build_long_horizon, on_road_m
 from scenarios.builders.proofs import read_proofs
 from scenarios.builders.sample import suite_on_map
-from scenarios.catalog import SUITES, load_suite, scenarios_chosen
+from scenarios.catalog import SUITES, load_suite
 from scenarios.events import EVENT_KINDS, react
 from sumo_nets.maps.mapstore import read_map
 

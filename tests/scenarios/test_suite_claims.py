@@ -24,6 +24,7 @@ from cosim.spec.scenario import (
     content_hash,
     read_suite,
 )
+from cosim.spec.selection import scenarios_chosen
 from scenarios.builders.building import build_suite
 from scenarios.builders.claims import CLAIMS, Read
 from scenarios.builders.daylight import drawn_daylight
@@ -32,7 +33,7 @@ from scenarios.builders.place_claims import faults_in_places, narrow_places, sam
 from scenarios.builders.proofs import Dropped, Proof, Proofs, read_proofs, write_proofs
 from scenarios.builders.recipes import LONG_WAY, RECIPES, Slot
 from scenarios.builders.unit import STRUCTURES, TURN_RAD, build_unit, turn_rad
-from scenarios.catalog import SUITES, load_suite, scenarios_chosen, with_crowd
+from scenarios.catalog import SUITES, load_suite, with_crowd
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.city.seeds import TEST_SEEDS, VAL_SEEDS

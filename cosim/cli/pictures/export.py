@@ -25,7 +25,8 @@ def export(
 ) -> None:
     """Write the street along a scenario's route as glTF: ground, buildings, trees, furniture, signals, barriers."""
     check_output(output, "glTF", (".glb",))
-    from scenarios.catalog import holding, load_suite, scenarios_chosen
+    from cosim.spec.selection import scenarios_chosen
+    from scenarios.catalog import holding, load_suite
     from scenarios.viewing.export import export_street
 
     (one,) = scenarios_chosen(holding(scenario) if suite is None else load_suite(suite), [scenario])

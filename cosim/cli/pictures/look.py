@@ -41,7 +41,8 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from scenarios.catalog import holding, load_suite, scenarios_chosen, with_crowd, with_robot
+    from cosim.spec.selection import scenarios_chosen
+    from scenarios.catalog import holding, load_suite, with_crowd, with_robot
     from scenarios.viewing.look import look_at
 
     picked = view_of(view)

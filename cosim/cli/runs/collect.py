@@ -152,7 +152,8 @@ def _source(
 
     from cosim.spec.robot import COURIER, robot_called
     from cosim.spec.scenario import Split
-    from scenarios.catalog import load_suite, scenarios_chosen, with_robot
+    from cosim.spec.selection import scenarios_chosen
+    from scenarios.catalog import load_suite, with_robot
     from scenarios.collecting.fresh import fresh, fresh_cities
 
     options = {"--cities": cities, "--map": map_name, "--scenario": scenario, "--split": split}

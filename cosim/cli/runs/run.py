@@ -49,15 +49,14 @@ _SHARED_HELP = (
     "One process draws for all environments and, if the policy has act_batch, asks it for all of them at once."
 )
 _ISOLATED_HELP = "The policy gets a process of its own and sees observations alone: it cannot reach into the simulator."
-_POLICY_HELP = (
-    "One of `cosim list`, your own as package.module:Class, a network as onnx:FOLDER, or a served one as zenoh:NAME."
-)
+_POLICY_HELP = "One of `cosim list`, your own as my.py:Class, a network as onnx:FOLDER, or a served one as zenoh:NAME."
 _POLICY_AT_HELP = "Where `cosim serve` listens, for --policy zenoh:NAME; may be repeated: servers share the episodes."
 _SEED_HELP = (
     "Of the run: policies' seeds and the names they are told are drawn from it; and the routes with --map (else 0)."
 )
 _OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have; every row is marked nonstandard."
 _SHARD_HELP = "Run only every N-th scenario, from the I-th on; needs --seed. `cosim merge` makes one run of all N."
+_EVENT_HELP = "Run only scenarios of this event, or static: of none; may be repeated."
 _JOBS_HELP = "Environment processes; with --on as many as the cluster has CPUs."
 _ON_HELP = "Run by a Ray cluster: ray (of this machine), auto, or ray://HOST:10001. A policy of yours is sent there."
 _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
@@ -69,7 +68,7 @@ def carry_out(
     robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
     episodes: Annotated[int | None, typer.Option(min=1, help="Run only the first so many scenarios.")] = None,
     scenario: Annotated[list[str] | None, typer.Option(help="Run only this scenario; may be repeated.")] = None,
-    event: Annotated[list[str] | None, typer.Option(help="Run only scenarios of this event; may be repeated.")] = None,
+    event: Annotated[list[str] | None, typer.Option(help=_EVENT_HELP)] = None,
     split: Annotated[str | None, typer.Option(help="Run only scenarios of val, or of test.")] = None,
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     policy_at: Annotated[list[str] | None, typer.Option(metavar="ENDPOINT", help=_POLICY_AT_HELP)] = None,
@@ -130,8 +129,9 @@ def carry_out(
     from cosim.spec.injection import Live
     from cosim.spec.options import EpisodeOptions, Outside
     from cosim.spec.policy_host import PolicyHost
+    from cosim.spec.selection import scenarios_chosen
     from scenarios.builders.fits import LOOKING, check_places
-    from scenarios.catalog import load_suite, scenarios_chosen, with_crowd, with_robot
+    from scenarios.catalog import load_suite, with_crowd, with_robot
     from scenarios.execution.asked import Patience
     from scenarios.execution.pace import announcement, remembered
     from scenarios.execution.suite_run import by_processes, held_run, planned_run, run_what_is_left
@@ -194,7 +194,7 @@ def carry_out(
         done = {one.id for one in picked} - {one.id for one in run.todo}
         _tell_of_beginning(run, plan.options.seed)
         if run.todo and carrier is None:
-            words = announcement(run.todo, policy, renderer, jobs, counterfactual)
+            words = announcement(run.todo, plan.policy, renderer, jobs, counterfactual)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
         board = Board(picked, done, compared=counterfactual)
         go = Going(run.held.path, [s.id for s in run.todo], counts)

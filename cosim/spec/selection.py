@@ -1,0 +1,88 @@
+"""Choose scenarios of a suite by id, event, split and number; and find the options that chose given ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from itertools import product
+from typing import Final, get_args
+
+from cosim.core.errors import UsageError, unknown
+from cosim.spec.scenario import Scenario, Split, Suite
+
+STATIC: Final = "static"
+"""The structure of `reactive` scenarios of the same places and ways without an event; chosen like an event."""
+_MOST_NAMED: Final = 3
+"""Scenarios listed by name where no other options choose them."""
+
+
+def scenarios_chosen(
+    whole: Suite,
+    ids: Sequence[str] = (),
+    episodes: int | None = None,
+    kinds: Sequence[str] = (),
+    split: str | None = None,
+) -> tuple[Scenario, ...]:
+    """The named scenarios of a suite (all when none is named) with events of the named kinds, the first `episodes`.
+
+    kinds: of events, or `static`. split: those of val or of test alone.
+
+    Raises UsageError with the valid names.
+    """
+    by_id = {scenario.id: scenario for scenario in whole.scenarios}
+    for scenario_id in ids:
+        if scenario_id not in by_id:
+            raise unknown("scenario", scenario_id, by_id)
+    picked = [by_id[i] for i in dict.fromkeys(ids)] or list(whole.scenarios)
+    there = {kind: None for scenario in picked for kind in _kinds_of(scenario)}
+    for kind in kinds:
+        if kind not in there:
+            raise unknown("event", kind, there)
+    if kinds:
+        picked = [s for s in picked if not _kinds_of(s).isdisjoint(kinds)]
+    if split is not None:
+        picked = [s for s in picked if s.split == split]
+        if not picked:
+            raise UsageError(f"suite '{whole.name}' has no scenarios of split '{split}' among those chosen")
+    return tuple(picked[:episodes])
+
+
+def selection_in_words(whole: Suite, ids: Sequence[str]) -> str:
+    """How many scenarios of a suite these are, and the options of `cosim run` that choose them.
+
+    >>> from cosim.spec.scenario import City
+    >>> one, other = (Scenario(id=name, suite="s", place=City(seed=0), seed=0, start=(0.0, 0.0, 0.0), goal=(9.0, 0.0),
+    ...     route=((0.0, 0.0), (9.0, 0.0)), time_limit_s=9.0) for name in "ab")
+    >>> selection_in_words(Suite(name="s", version="1", scenarios=(one, other)), ["a"])
+    '1 of 2 (--episodes 1)'
+    """
+    words = " ".join(_options_for(whole, ids)) or ("all" if len(ids) == len(whole.scenarios) else "by --scenario")
+    return f"{len(ids)} of {len(whole.scenarios)} ({words})"
+
+
+def _options_for(whole: Suite, ids: Sequence[str]) -> list[str]:
+    """The fewest options that choose exactly these scenarios; none for all of them, or where none do."""
+    picked = [scenario for scenario in whole.scenarios if scenario.id in {*ids}]
+    each = [_kinds_of(scenario) for scenario in picked]
+    known = [*dict.fromkeys(kind for scenario in whole.scenarios for kind in sorted(_kinds_of(scenario)))]
+    every = tuple(kind for kind in known if any(kind in kinds for kinds in each))
+    common = [(kind,) for kind in known if all(kind in kinds for kinds in each)]
+    choices = product((None, *get_args(Split)), ((), *common, every), (None, len(ids)))
+    for split, kinds, episodes in sorted(choices, key=lambda one: sum(map(bool, one))):
+        try:
+            found = scenarios_chosen(whole, (), episodes, kinds, split)
+        except UsageError:
+            continue
+        if {scenario.id for scenario in found} == {*ids}:
+            return _as_options(kinds, split, episodes)
+    return [f"--scenario {name}" for name in ids] if len(ids) <= _MOST_NAMED else []
+
+
+def _as_options(kinds: Iterable[str], split: str | None, episodes: int | None) -> list[str]:
+    options = [f"--event {kind}" for kind in kinds]
+    options += [f"--split {split}"] if split else []
+    return options + ([f"--episodes {episodes}"] if episodes else [])
+
+
+def _kinds_of(scenario: Scenario) -> set[str]:
+    """What `--event` finds a scenario by."""
+    return {event.kind for event in scenario.events} or ({STATIC} if scenario.structure == STATIC else set())
