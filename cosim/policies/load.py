@@ -139,6 +139,9 @@ def _made(name: str) -> Policy:
         if not isinstance(error.__cause__, ModuleNotFoundError):
             raise
         raise UsageError(f"{error}. {remedy_for_missing(name, error.__cause__.name or '')}") from error
+    if getattr(module, "__file__", None) is None:  # a folder without __init__.py, such as a run's
+        words = f"'{module.__name__}' is a folder without code here"
+        raise UsageError(f"policy '{name}': {words}. {remedy_for_missing(name, module.__name__)}")
     make = policy_class(module, class_name)
     with _in_words(f"policy '{name}' cannot be made:"):
         return cast(Policy, make())

@@ -231,6 +231,9 @@ def test_a_module_that_is_not_found_says_where_it_was_searched(desk: Path, monke
         "Run the command in the folder that holds alone.py, add that folder to PYTHONPATH, or name the file: "
         "deeper/alone.py:Mine"
     )
+    (desk / "lost").mkdir()
+    with pytest.raises(UsageError, match=r"'lost' is a folder without code here. Searched: .*path/to/lost.py:Mine$"):
+        load_policy("lost:Mine")
     (desk / "mine.py").write_text("import not_installed")
     with pytest.raises(UsageError) as caught:
         load_policy("mine.py:Mine")

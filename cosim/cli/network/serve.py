@@ -17,13 +17,13 @@ serve_app = typer.Typer()
     "serve",
     rich_help_panel=MANY,
     epilog="Examples, each with a run in another terminal:  \n"
-    "`cosim serve my_robot.policy:Mine --name mine`, "
+    "`cosim serve my.py:Mine --name mine`, "
     "`cosim run reactive --policy zenoh:mine --policy-at tcp/127.0.0.1:7449`  \n"
-    "`cosim serve my_robot.policy:Mine --name mine --listen tls/0.0.0.0:7449 --tls certs/policy`  \n"
-    "`cosim serve my_robot.policy:Mine --name mine --connect tcp/127.0.0.1:7449`: a further one, where another listens",
+    "`cosim serve my.py:Mine --name mine --listen tls/0.0.0.0:7449 --tls certs/policy`  \n"
+    "`cosim serve my.py:Mine --name mine --connect tcp/127.0.0.1:7449`: a further one, where another listens",
 )
 def serve_command(
-    policy: Annotated[str, typer.Argument(help="Your own, as package.module:Class, or a baseline.")],
+    policy: Annotated[str, typer.Argument(help="Your own, as my.py:Class, or a baseline.")],
     name: Annotated[str, typer.Option(help="What runs ask for, as --policy zenoh:NAME; else the manifest's.")] = "",
     listen: Annotated[str, typer.Option(metavar="ENDPOINT", help="Where runs find it.")] = POLICIES_AT,
     connect: Annotated[

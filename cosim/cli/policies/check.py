@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from scenarios.policy_check.checks import CheckedPolicy
 
 policy_app = typer.Typer(no_args_is_help=True, help="Policies: are they what they are taken for?")
-_NAME_HELP = "As --policy of `cosim run` has it: a name, package.module:Class, onnx:FOLDER, zenoh:NAME."
+_NAME_HELP = "As --policy of `cosim run` has it: a name, my.py:Class, onnx:FOLDER, zenoh:NAME."
 _GOAL_HELP = "What it is told of where to go (`cosim list`), in place of what its manifest says."
 _FRAMES_HELP = "Observations of each drive: more than the history of the policy is long."
 _OWN_CAMERA_HELP = "It may see by a camera that the robot does not have."
@@ -37,7 +37,7 @@ def policies() -> None:
 
 @policy_app.command(
     "check",
-    epilog="Examples:  \n`cosim policy check mine:Model -o check.png`  \n`cosim policy check onnx:bundle --json`  \n"
+    epilog="Examples:  \n`cosim policy check my.py:Mine -o check.png`  \n`cosim policy check onnx:bundle --json`  \n"
     "`cosim policy check zenoh:vint --policy-at tcp/gpu:7449 --goal image`",
 )
 def check_policy(

@@ -49,7 +49,7 @@ _UNSOLVED_HELP = "Keep also what the expert does not solve, up to where the robo
     epilog="Examples:  \n"
     "`cosim collect reactive --cities 900:940 --event gesturing --episodes 500 --jobs 2 --out demos/gesturing`  \n"
     "`cosim collect unit --cities 900:980 --episodes 1000 --noise 0.2 --out demos/unit`  \n"
-    "`cosim collect reactive --split val --policy my_robot.policy:Mine --camera 96x96 --rate 4 --out demos/val`  \n"
+    "`cosim collect reactive --split val --policy my.py:Mine --camera 96x96 --rate 4 --out demos/val`  \n"
     "`cosim collect reactive --cities 900:940 --fov 60 --noise 0.7 --learner small --unsolved --out demos/again`  \n"
     "`cosim collect ... --out demos/unit --resume`, where it was stopped; then `cosim dataset pack`",
 )
@@ -65,7 +65,7 @@ def collect_command(
         float, typer.Option(min=300.0, max=5000.0, help="Metres; of the cities of --cities.")
     ] = 2000.0,
     map_name: Annotated[str | None, typer.Option("--map", help="Draw on this place: a map, a folder, a net.")] = None,
-    policy: Annotated[str, typer.Option(help="The expert: a baseline, or your own as package.module:Class.")] = "orca",
+    policy: Annotated[str, typer.Option(help="The expert: a baseline, or your own as my.py:Class.")] = "orca",
     robot: Annotated[str, typer.Option(help=ROBOT_HELP)] = "",
     size: Annotated[str, typer.Option("--camera", metavar="WxH", help="Pixels of the pictures.")] = "160x90",
     fov: Annotated[float, typer.Option(min=1.0, max=170.0, help="Degrees from its lower to its upper edge.")] = 75.0,

@@ -38,7 +38,7 @@ _OF_ONE_MACHINE = {
     "`cosim worker --jobs 2`  \n"
     "`cosim coordinator reactive --policy orca --out runs/mine --resume`, after it was stopped or killed  \n"
     "`cosim coordinator reactive --policy orca --seed 7 --shard 1/2 --out runs/1`: see `cosim merge`  \n"
-    "`cosim coordinator reactive --policy my_robot.policy:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
+    "`cosim coordinator reactive --policy my.py:Mine --listen tls/0.0.0.0:7447 --tls certs/coordinator`",
 )
 @taking(carry_out, without=("carrier", "jobs", "director_wait", "tls", "insecure"), hidden=_OF_ONE_MACHINE)
 def coordinator_command(

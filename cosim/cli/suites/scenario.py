@@ -171,11 +171,11 @@ def draw_own(
     epilog="Examples:  \n`cosim scenario run mine.toml --policy orca`  \n"
     "`cosim scenario run sweep.toml --policy social_force --jobs 2 --out runs/sweep`  \n"
     "`cosim scenario run sweep.toml --policy social_force --out runs/sweep --resume`  \n"
-    "`cosim scenario run mine.toml --policy my_robot.policy:Mine --real-time --rerun mine.rrd`",
+    "`cosim scenario run mine.toml --policy my.py:Mine --real-time --rerun mine.rrd`",
 )
 def run_own(
     file: Annotated[Path, typer.Argument(help=_FILE_HELP)],
-    policy: Annotated[str, typer.Option(help="A baseline, or your own as package.module:Class.")] = "route",
+    policy: Annotated[str, typer.Option(help="A baseline, or your own as my.py:Class.")] = "route",
     jobs: Annotated[int, typer.Option(min=1, help="Environment processes.")] = 1,
     folder: Annotated[Path | None, typer.Option("--out", help="Run folder; default runs/NAME-POLICY-TIME.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Finish the run in --out.")] = False,

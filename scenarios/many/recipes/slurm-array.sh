@@ -10,7 +10,7 @@
 # A run in shards, one for each task of a job array, which must count from 1. A task that was stopped and is queued
 # again goes on where it was. OUT lies on a disk that all nodes share, or is copied together before the merge.
 #
-#   job=$(sbatch --parsable slurm-array.sh reactive my_robot.policy:Mine 7 runs/mine)
+#   job=$(sbatch --parsable slurm-array.sh reactive my.py:Mine 7 runs/mine)
 #   sbatch --dependency=afterany:$job --wrap "cosim merge runs/mine/shard-* --out runs/mine/whole"
 #
 # The nodes need processors of one kind, for the same bits: --constraint. Tried without Slurm, by a loop that sets what
