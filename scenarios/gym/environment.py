@@ -97,10 +97,14 @@ class SidewalkEnv(gymnasium.Env[SeenParts, NDArray[Any]]):
         truncated = happened.ended == "timeout"
         return seen_by(observation, self._seen_space), reward, episode.over and not truncated, truncated, info
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """(360, 640, 3) uint8: the robot from behind, in its street; None without `render_mode="rgb_array"`."""
+    def render(self) -> NDArray[np.uint8]:
+        """Draw the robot from behind, in its street: (360, 640, 3) uint8. Raises UsageError without a render mode."""
         if self.render_mode is None:
-            return None
+            raise UsageError(
+                "render() was called, but the environment has no render_mode. Choose one when it is made: "
+                'gymnasium.make("cosim/Reactive-v1", render_mode="rgb_array") or '
+                'cosim.make_env("reactive", render_mode="rgb_array")'
+            )
         if self._episode is None:
             raise UsageError("nothing to render: no episode is under way, call reset() first")
         if self._eyes is None:

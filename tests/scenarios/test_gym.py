@@ -156,6 +156,15 @@ def test_without_gymnasium_one_is_told_what_to_install(monkeypatch: pytest.Monke
         cosim.make_env("unit")
 
 
+def test_an_environment_without_a_render_mode_says_how_to_get_pictures() -> None:
+    """`render()` raises; the message names the mode and the call that sets it."""
+    with (
+        gymnasium.make("cosim/Unit-v1", manifest=BLIND) as env,
+        pytest.raises(UsageError, match=r"no render_mode.*gymnasium\.make\(.*render_mode=\"rgb_array\"\)"),
+    ):
+        env.unwrapped.render()
+
+
 @pytest.mark.engine
 def test_the_checker_of_gymnasium_is_content() -> None:
     """`check_env` passes for what is seen by a camera with depth and a picture as a goal, rendering too; it warns of
