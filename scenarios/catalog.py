@@ -59,6 +59,42 @@ def holding(scenario_id: str) -> Suite:
     raise unknown("scenario", scenario_id, ids)
 
 
+def one_scenario(name: str, suite: str | None = None, which: str | None = None) -> tuple[Suite, int]:
+    """Find one scenario by its id, or by the path of its file: the suite with it alone, and of how many it is one.
+
+    suite: where to look for the id; by default in the shipped suites. which: of a file, the id or the number,
+    counted from 1; by default the first. Raises UsageError with the valid choices, SpecError for a file with faults.
+    """
+    if not name.endswith((".json", ".toml")):
+        if which is not None:
+            raise UsageError(f"--scenario chooses from a file, and '{name}' is a scenario's id: leave --scenario out")
+        whole = holding(name) if suite is None else load_suite(suite)
+        return msgspec.structs.replace(whole, scenarios=scenarios_chosen(whole, [name])), 1
+    if suite is not None:
+        raise UsageError(f"{name} is a file: leave --suite out, and choose one of its scenarios by --scenario")
+    if name.endswith(".json"):
+        whole = load_suite(name)
+        one = _picked([scenario.id for scenario in whole.scenarios], which)
+        return msgspec.structs.replace(whole, scenarios=(whole.scenarios[one],)), len(whole.scenarios)
+    from scenarios.own.making import made_one, suite_of
+    from scenarios.own.reading import read_own
+
+    own = read_own(Path(name))
+    variant = own.variants[_picked([variant.id for variant in own.variants], which)]
+    return suite_of(own, [made_one(variant, own.name)]), len(own.variants)
+
+
+def _picked(ids: Sequence[str], which: str | None) -> int:
+    """Return the index of the scenario with this id or number; 0 for None."""
+    if which is None:
+        return 0
+    if which in ids:
+        return ids.index(which)
+    if which.isdecimal() and 1 <= int(which) <= len(ids):
+        return int(which) - 1
+    raise UsageError(f"{unknown('scenario', which, ids)} Or its number, 1 to {len(ids)}.")
+
+
 def with_crowd(whole: Suite, **asked: float | None) -> Suite:
     """The suite with these fields of `CrowdSpec` in each scenario: another suite, whose version and rows say so.
 

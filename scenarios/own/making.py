@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -82,7 +82,11 @@ def made_one(variant: Variant, suite: str) -> Made:
 
 def suite_of_own(file: OwnFile, tell: Tell = untold) -> Suite:
     """All scenarios of a file, to be run. Raises SpecError with everything that is against it."""
-    made = list(made_of(file, tell))
+    return suite_of(file, list(made_of(file, tell)))
+
+
+def suite_of(file: OwnFile, made: Sequence[Made]) -> Suite:
+    """Join scenarios that were made of a file as a suite. Raises SpecError with everything that is against them."""
     if faults := dict.fromkeys(fault for one in made for fault in one.faults):
         raise SpecError(f"{file.path}: {in_lines(list(faults), len(faults))}")
     scenarios = tuple(one.scenario for one in made if one.scenario is not None)

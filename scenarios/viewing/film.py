@@ -8,6 +8,7 @@ state hash to show, but every tick of it is as recorded.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, NamedTuple
@@ -16,7 +17,7 @@ import cv2
 import numpy as np
 
 from cosim.core.clock import Clock
-from cosim.core.errors import RunError
+from cosim.core.errors import RunError, listed
 from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, RobotState, Street
 from cosim.core.telling import Tell, untold
@@ -24,9 +25,12 @@ from cosim.episode.following import Following
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
+from cosim.records.record import Record
+from cosim.records.run_folder import read_records, read_spec
 from cosim.report import hud
 from cosim.report.legend import Image
 from cosim.report.minimap import PLANNED, Minimap
+from cosim.report.page.reasons import mishaps_of, reason_of
 from cosim.report.video import Video
 from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
@@ -49,6 +53,8 @@ ABOVE_REST: Final = (2.0, 0.0, 10.0)
 ABOVE_HIGH_M: Final = (6.5, 12.0)
 _NEAR_M: Final = 8.0
 """Event people this near are kept in the picture from above."""
+BEFORE_S, AFTER_S = 10.0, 2.0
+"""The film of a failure begins and ends so many seconds before and after it."""
 
 
 class Cut(NamedTuple):
@@ -61,6 +67,48 @@ class Cut(NamedTuple):
     speed: int = 1
     camera: CameraChoice = "auto"
     view: Viewpoint = "follow"
+
+
+class FilmedFailure(NamedTuple):
+    """The first failure of an episode: when it happened, why, and the seconds that a film of it shows."""
+
+    scenario: str
+    at_s: float
+    reason: str
+    from_s: float
+    to_s: float
+
+
+def failure_to_film(folder: Path, scenario_id: str | None) -> FilmedFailure:
+    """Choose the first failure of an episode; without an id, of the first failed episode in the order of the run.
+
+    Raises UsageError for an unknown episode, and RunError with the outcomes where nothing failed.
+    """
+    records = {record.scenario: record for record in read_records(folder)}
+    failed = [name for name in read_spec(folder).scenarios if name in records and _failed(records[name])]
+    if scenario_id is not None and scenario_id in records and scenario_id not in failed:
+        others = f". Episodes that failed: {listed(scenario_id, failed)}" if failed else ""
+        raise RunError(f"{folder}: '{scenario_id}' did not fail: {_outcome(records[scenario_id])}{others}")
+    if scenario_id is None and not failed:
+        outcomes = Counter("succeeded" if one.status == "done" else one.status for one in records.values())
+        counts = ", ".join(f"{count} {outcome}" for outcome, count in outcomes.items()) or "no episode has ended"
+        raise RunError(f"{folder}: no episode failed: {counts}. Name an EPISODE to film it")
+    told = recorded(folder, scenario_id or failed[0])
+    mishap = mishaps_of(told.record)[0]
+    at_s = Clock().time_s(mishap.tick + 1)
+    reason = reason_of(told.scenario, told.record, mishap, told.log)
+    return FilmedFailure(told.record.scenario, at_s, reason, max(0.0, at_s - BEFORE_S), at_s + AFTER_S)
+
+
+def _failed(record: Record) -> bool:
+    """Return whether an episode came to its end and something went wrong in it."""
+    return record.ended is not None and bool(mishaps_of(record))
+
+
+def _outcome(record: Record) -> str:
+    if record.status == "done":
+        return f"it ended {'at the goal' if record.ended == 'goal' else f'by {record.ended}'}"
+    return f"it is {record.status}: {record.reason}"
 
 
 def make_film(folder: Path, scenario_id: str, output: Path, cut: Cut, tell: Tell = untold) -> float:

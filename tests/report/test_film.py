@@ -23,8 +23,9 @@ from cosim.report.video import Video
 from cosim.spec.robot import COURIER
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
 from physics.cameras.eyes import WorldCamera
-from scenarios.viewing.film import Cut, robot_eye
+from scenarios.viewing.film import Cut, failure_to_film, robot_eye
 from tests.conftest import Cosim
+from tests.records.driven_runs import HIT, run_of, short_way
 
 pytestmark = pytest.mark.engine
 
@@ -79,6 +80,16 @@ def test_a_film_is_from_above_or_from_the_robot(desk: Path, cosim: Cosim) -> Non
     apart = np.abs(seen[0] - seen[1]).mean(axis=2)
     assert apart[: layout.view.height, : layout.view.width].mean() > 15
     assert apart[layout.map.y + 4 : layout.bar.y - 4, layout.map.x + 4 :].mean() < 3
+
+
+def test_a_film_of_a_failure_ends_with_it(desk: Path, cosim: Cosim) -> None:
+    """Without an episode the first that failed is filmed, from any view; when and why is printed."""
+    words = ("film", "run", "--failure", "--from", "1.8", "--view", "above", "--size", "320x180", "-o", "failure.mp4")
+    done = cosim(*words, cwd=desk)
+    assert done.returncode == 0, done.stderr
+    assert "t-0, 2.0 s: ran out of time after 2 s, with " in done.stdout
+    with av.open(str(desk / "failure.mp4")) as film:
+        assert sum(1 for _ in film.decode(video=0)) == 4
 
 
 @pytest.mark.parametrize("size", [(320, 180), (1280, 720), (1024, 1024)])
@@ -149,6 +160,8 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
     ("words", "told"),
     [
         (("film", "run", "t-9"), "unknown finished episode"),
+        (("film", "run"), "name one of its episodes, or give --failure: t-0"),
+        (("film", "run", "t-9", "--failure"), "unknown finished episode"),
         (("film", "run", "t-0", "--from", "99"), "nothing to film"),
         (("film", "run", "t-0", "--from", "1", "--to", "nan"), "give a later --to"),
         (("film", "run", "t-0", "--size", "wide"), "--size 'wide'"),
@@ -160,6 +173,11 @@ def test_a_record_that_does_not_replay_is_told(desk: Path, cosim: Cosim) -> None
         (("look", "t-0", "--suite", "tiny.json", "--view", "inside"), "unknown view"),
         (("look", "t-9", "--suite", "tiny.json"), "unknown scenario"),
         (("look", "t-9"), "unknown scenario 't-9'. Valid choices: 1335, among them"),
+        (("look", "t-0", "--suite", "tiny.json", "--scenario", "2"), "--scenario chooses from a file"),
+        (("look", "tiny.json", "--suite", "tiny.json"), "tiny.json is a file: leave --suite out"),
+        (("look", "tiny.json", "--scenario", "t-9"), "unknown scenario 't-9'. Valid choices: t-0"),
+        (("look", "tiny.json", "--scenario", "2"), "unknown scenario '2'. Valid choices: t-0. Or its number"),
+        (("look", "nowhere.toml"), "nowhere.toml: cannot be read: No such file"),
         (("look", "t-0", "--suite", "tiny.json", "-o", "look.gif"), "use a name that ends in .png or .jpg"),
         (("look", "t-0", "--suite", "tiny.json", "-o", "nowhere/look.png"), "written"),
     ],
@@ -188,6 +206,41 @@ def test_a_look_is_a_picture_of_its_moment(desk: Path, cosim: Cosim) -> None:
         seen[name] = cv2.imread(str(desk / f"{name}.png"))
         assert seen[name].shape == (90, 160, 3) and seen[name].std() > 10
     assert (seen["start"] != seen["above"]).mean() > 0.5
+
+
+def test_a_look_at_a_file_of_ones_own_needs_no_suite(desk: Path, cosim: Cosim) -> None:
+    """Of a sweep the first, or the one that is named or numbered; only that one is made, and its faults are listed."""
+    text = 'name = "mine"\nseeds = 2\n[place]\ncity = 1\nsize_m = 500\n[way]\nkind = "straight"\nlength_m = 30\n'
+    text += '[[events]]\nkind = "frontal"\nat_m = [25, 2]\n'
+    (desk / "mine.toml").write_text(text)
+    for words, told in {
+        (): "mine-at_m25-s0 at 0.00 s, robot; 1 of 4 scenarios: --scenario chooses another)",
+        ("--scenario", "2"): "mine-at_m25-s1 at",
+        ("--scenario", "mine-at_m25-s1"): "mine-at_m25-s1 at",
+    }.items():
+        done = cosim("look", "mine.toml", *words, "--size", "160x90", "-o", "mine.png", cwd=desk)
+        assert done.returncode == 0 and told in done.stdout, done.stderr
+        assert cv2.imread(str(desk / "mine.png")).std() > 10
+    done = cosim("look", "mine.toml", "--scenario", "3", "-o", "none.png", cwd=desk)
+    assert done.returncode == 2 and "mine.toml: events[0]: at_m 2 does not do" in done.stderr
+    done = cosim("look", "mine.toml", "--scenario", "mine", "-o", "none.png", cwd=desk)
+    assert done.returncode == 2 and "unknown scenario 'mine'. Valid choices: mine-at_m2-s0, mine-" in done.stderr
+
+
+def test_the_failure_of_an_episode_is_chosen_and_cut_out(tmp_path: Path) -> None:
+    """The first that failed in the order of the run, or the named one: ten seconds before its first failure, two after.
+    What did not fail is refused with what became of it."""
+    ways = [short_way(f"s-{k}", ends_on_failure=False) for k in range(3)]
+    run = run_of(tmp_path / "run", ["goal", HIT, HIT], scenarios=ways)
+    first, named = failure_to_film(run, None), failure_to_film(run, "s-2")
+    assert (first.scenario, named.scenario) == ("s-1", "s-2")
+    assert first.at_s == 4.0 and (first.from_s, first.to_s) == (0.0, 6.0)
+    assert first.reason == "drove into a wall at 1.0 m/s"
+    with pytest.raises(RunError, match=r"'s-0' did not fail: it ended at the goal. Episodes that failed: s-1, s-2$"):
+        failure_to_film(run, "s-0")
+    sound = run_of(tmp_path / "sound", ["goal", "goal", "crashed", "invalid"])
+    with pytest.raises(RunError, match=r"sound: no episode failed: 2 succeeded, 1 crashed, 1 invalid"):
+        failure_to_film(sound, None)
 
 
 def test_a_video_that_failed_leaves_nothing(tmp_path: Path) -> None:

@@ -21,10 +21,17 @@ look_app = typer.Typer()
 
 @look_app.command(
     rich_help_panel=LOOK,
-    epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`",
+    epilog="Examples:  \n`cosim look lh-011-00 --at 20 -o frame.png`  \n`cosim look lh-011-00 --residents 8`  \n"
+    "`cosim look mine.toml --scenario 2 --view above`",
 )
 def look(
-    scenario: Annotated[str, typer.Argument(help="A scenario's id (`cosim list long-horizon`).")],
+    scenario: Annotated[
+        str, typer.Argument(help="A scenario's id (`cosim list long-horizon`), or a file: your .toml, a suite's .json.")
+    ],
+    which: Annotated[
+        str | None,
+        typer.Option("--scenario", help="Of a file, which scenario: its id or its number; by default the first."),
+    ] = None,
     at: Annotated[float, typer.Option(min=0.0, help="Seconds into the episode.")] = 0.0,
     view: Annotated[str, typer.Option(help="robot, follow (from behind) or above.")] = "robot",
     size: Annotated[str, typer.Option(help="Width x height in pixels.")] = "1280x720",
@@ -41,21 +48,21 @@ def look(
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
     """Look at a scenario: one picture of what the robot sees, or of the robot in its street."""
-    from cosim.spec.selection import scenarios_chosen
-    from scenarios.catalog import holding, load_suite, with_crowd, with_robot
+    from scenarios.catalog import one_scenario, with_crowd, with_robot
     from scenarios.viewing.look import look_at
 
     picked = view_of(view)
     pixels = size_of(size)
     check_output(output)
-    found = holding(scenario) if suite is None else load_suite(suite)
-    whole = with_crowd(with_robot(found, robot), residents=residents, groups=groups, elderly=elderly, children=children)
-    (one,) = scenarios_chosen(whole, [scenario])
+    found, of = one_scenario(scenario, suite, which)
+    asked = with_crowd(with_robot(found, robot), residents=residents, groups=groups, elderly=elderly, children=children)
+    (one,) = asked.scenarios
+    more = "" if which or of == 1 else f"; 1 of {of} scenarios: --scenario chooses another"
     with doing("choosing the camera") as tell:
         image, time_s = look_at(one, policy, at, picked, pixels, camera_here(camera), tell)
     instead = replaced(output)
     _save(image, output)
-    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view}){instead}", soft_wrap=True, highlight=False)
+    out.print(f"Picture: {output} ({one.id} at {time_s:.2f} s, {view}{more}){instead}", soft_wrap=True, highlight=False)
 
 
 def _save(image: object, path: Path) -> None:
