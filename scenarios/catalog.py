@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 
@@ -10,6 +10,7 @@ import msgspec
 
 from cosim.core.errors import UsageError, unknown
 from cosim.spec.scenario import Suite, read_suite
+from cosim.spec.selection import scenarios_chosen
 from scenarios.events import EVENT_KINDS
 
 _HERE = Path(__file__).parent / "suites"
