@@ -1,8 +1,7 @@
 """Serve a policy to `cosim run --policy zenoh:NAME --policy-at ENDPOINT`, from any Python >= 3.9, here or elsewhere.
 
-One file, to be copied beside a policy: it needs eclipse-zenoh, msgspec and numpy, and nothing of cosim. `serve` asks
-the policy in the thread that calls it. The simulator asks and waits; each question is signed with run, episode, attempt
-and step and may come again: then the kept answer is given again, and the policy is not asked twice.
+One file to copy beside a policy; it needs eclipse-zenoh, msgspec and numpy. `serve` asks the policy in the thread that
+calls it. A question is signed with run, episode, attempt and step: one that comes again gets the cached answer.
 """
 
 from __future__ import annotations
@@ -364,32 +363,33 @@ def _crash(error: BaseException, among: str = "") -> bytes:
     return encode_asked(Refusal("policy", f"raised {type(error).__name__}{': ' * bool(said)}{said}{among}"))
 
 
+class _Given(SimpleNamespace):
+    """A goal, a pose or a picture. For numpy: its pixels, or its numbers without those that are None."""
+
+    def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
+        held = vars(self)
+        pixels = [held[name] for name in ("rgb", "pixels") if name in held]
+        if not pixels and "x_m" not in held:
+            raise TypeError(f"this is no array: read its {', '.join(held)}")
+        return np.array(pixels[0] if pixels else [value for value in held.values() if value is not None], dtype)
+
+
 def _plain_observation(told: str, about: AboutEpisode, one: AskAct, arrays: dict[str, Any]) -> SimpleNamespace:
     """What a policy is given where cosim is not installed: by the names that `cosim.Observation` has."""
-
-    def camera(name: str) -> SimpleNamespace | None:
-        told_camera = about.cameras.get(name)
-        names = ("matrix", "distortion", "on_robot")
-        return None if told_camera is None else SimpleNamespace(**dict(zip(names, map(np.array, told_camera))))
-
-    goal = None
-    if one.goal is not None:
-        goal = SimpleNamespace(**{key: value for key, value in one.goal.items() if key != "type"})
-        if "goal" in arrays:
-            setattr(goal, "rgb" if one.goal.get("type") == "image" else "pixels", arrays["goal"])
-    odometry = None
-    if one.odometry is not None:
-        odometry = SimpleNamespace(**dict(zip(("x_m", "y_m", "heading_rad"), one.odometry)))
+    names = ("matrix", "distortion", "on_robot")
+    cameras = {name: _Given(**dict(zip(names, map(np.array, held)))) for name, held in about.cameras.items()}
+    goal = dict(one.goal or {})
+    kind = goal.pop("type", "")
+    if "goal" in arrays:
+        goal["rgb" if kind == "image" else "pixels"] = arrays["goal"]
+    pose = None if one.odometry is None else _Given(**dict(zip(("x_m", "y_m", "heading_rad"), one.odometry)))
     further = sorted({name.partition("/")[0] for name in arrays if "/" in name})
-    picture = {name: [arrays.get(f"{name}/{kind}") for kind in ("rgb", "depth", "labels")] for name in further}
+    picture = {name: {kind: arrays.get(f"{name}/{kind}") for kind in ("rgb", "depth", "labels")} for name in further}
     return SimpleNamespace(
         tick=one.tick, time_s=one.time_s, v_mps=one.v_mps, w_radps=one.w_radps, reset=one.reset, episode=told,
-        robot=SimpleNamespace(**about.robot), goal=goal, odometry=odometry, privileged=None, camera=camera(""),
-        rgb=arrays.get("rgb"), depth=arrays.get("depth"), labels=arrays.get("labels"),
-        pictures={
-            name: SimpleNamespace(rgb=rgb, depth=depth, labels=labels, camera=camera(name))
-            for name, (rgb, depth, labels) in picture.items()
-        },
+        robot=SimpleNamespace(**about.robot), goal=_Given(**goal) if goal else None, odometry=pose, privileged=None,
+        camera=cameras.get(""), rgb=arrays.get("rgb"), depth=arrays.get("depth"), labels=arrays.get("labels"),
+        pictures={name: _Given(**held, camera=cameras.get(name)) for name, held in picture.items()},
     )  # fmt: skip
 
 

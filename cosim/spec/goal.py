@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import msgspec
 import numpy as np
@@ -35,8 +35,9 @@ GOALS: Final[Mapping[str, str]] = MappingProxyType(
 class PointGoal(msgspec.Struct, frozen=True, tag="point"):
     """A point in the robot's frame, in metres: x ahead, y to the left.
 
-    >>> PointGoal(3.0, 4.0).distance_m
-    5.0
+    >>> goal = PointGoal(3.0, 4.0)
+    >>> goal.distance_m, np.asarray(goal)
+    (5.0, array([3., 4.]))
     """
 
     x_m: float
@@ -51,6 +52,10 @@ class PointGoal(msgspec.Struct, frozen=True, tag="point"):
         """Where it lies, counter-clockwise from ahead, in (-pi, pi]."""
         return math.atan2(self.y_m, self.x_m)
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """(2,) float64 metres: x ahead, y to the left."""
+        return np.array((self.x_m, self.y_m), dtype)
+
 
 class ImageGoal(msgspec.Struct, frozen=True, tag="image"):
     """A picture of where to go: (H, W, 3) uint8, as large as the camera's.
@@ -61,6 +66,10 @@ class ImageGoal(msgspec.Struct, frozen=True, tag="image"):
 
     rgb: NDArray[np.uint8]
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """(H, W, 3) uint8."""
+        return np.array(self.rgb, dtype, copy=copy)
+
 
 class Instruction(msgspec.Struct, frozen=True, tag="instruction"):
     """What to do, in words.
@@ -70,6 +79,10 @@ class Instruction(msgspec.Struct, frozen=True, tag="instruction"):
     """
 
     text: str
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Raises TypeError: it is a text."""
+        raise TypeError("an instruction is a text and no array: read observation.goal.text, or ask for another goal")
 
 
 class RoutePatch(msgspec.Struct, frozen=True, tag="route_patch"):
@@ -82,6 +95,10 @@ class RoutePatch(msgspec.Struct, frozen=True, tag="route_patch"):
     """
 
     pixels: NDArray[np.uint8]
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """(80, 80) uint8."""
+        return np.array(self.pixels, dtype, copy=copy)
 
 
 Goal = PointGoal | ImageGoal | Instruction | RoutePatch

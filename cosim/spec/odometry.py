@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 OdometryKind = Literal["none", "exact", "wheel", "gps"]
 
@@ -25,13 +27,19 @@ class Odometry(msgspec.Struct, frozen=True):
     """Where the robot takes itself to be: metres ahead and to the left of its start, heading counter-clockwise from the
     start's, None for gps. Nothing in it tells where on the map that is.
 
-    >>> Odometry(12.0, 0.5, heading_rad=0.1).x_m
-    12.0
+    >>> pose = Odometry(12.0, 0.5, heading_rad=0.1)
+    >>> pose.x_m, np.asarray(pose)
+    (12.0, array([12. ,  0.5,  0.1]))
     """
 
     x_m: float
     y_m: float
     heading_rad: float | None
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """(3,) float64: x, y in metres, heading in radians; (2,) without a heading."""
+        known = (self.x_m, self.y_m, self.heading_rad)[: 2 if self.heading_rad is None else 3]
+        return np.array(known, dtype)
 
 
 class WheelNoise(NamedTuple):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,10 @@ class Calibration:
     distortion: Floats
     on_robot: Floats
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """Raises TypeError: it is three arrays."""
+        raise TypeError("a camera is no array: read .matrix (3, 3), .distortion (5,) or .on_robot (4, 4)")
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraPicture:
@@ -40,3 +45,7 @@ class CameraPicture:
     labels: NDArray[np.uint8] | None
     depth: NDArray[np.float32] | None
     camera: Calibration
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray[Any]:
+        """(H, W, 3) uint8: `rgb`."""
+        return np.array(self.rgb, dtype, copy=copy)

@@ -13,14 +13,17 @@ from scenarios.checks import small_scenario
 from tests.conftest import Cosim
 
 POLICY = """
+import numpy as np
 import speeds
 from cosim.core.state import Command
 from cosim.episode.ports import Manifest
 
 class Far:
-    manifest = Manifest("far", camera=None)
+    manifest = Manifest("far", camera=None, goal="route_point", odometry="wheel")
     def reset(self, episode_id, seed): pass
-    def act(self, observation): return Command(speeds.AHEAD_MPS, 0.0)
+    def act(self, observation):
+        ahead_m, _ = np.asarray(observation.goal)
+        return Command(min(ahead_m, speeds.AHEAD_MPS), 0.0 * np.asarray(observation.odometry).sum())
 """
 
 

@@ -1,0 +1,197 @@
+"""The README's table of all that an observation holds, against observations of real episodes."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator, Mapping
+from types import SimpleNamespace
+from typing import Any, NamedTuple, get_args
+
+import msgspec
+import numpy as np
+import pytest
+
+from bridge.policy_server import AskAct, _plain_observation
+from cosim.core.state import Command
+from cosim.episode.given import calibration_of
+from cosim.episode.ports import CameraSpec, Manifest, Observation
+from cosim.spec.goal import GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
+from cosim.spec.odometry import Odometry
+from cosim.spec.options import EpisodeOptions
+from cosim.spec.picture import CameraPicture
+from cosim.spec.robot import COURIER
+from cosim.spec.scenario import CrowdSpec
+from scenarios.checks import small_scenario
+from scenarios.execution.episode import Episode
+from scenarios.serving.observed import GOAL, arrays_of, seen_from_afar, told_about, told_goal
+from tests.conftest import ROOT
+
+SPEC = CameraSpec(32, 24, depth=True, labels=True)
+ALL = Manifest(
+    "all", camera=SPEC, odometry="wheel", privileged=True,
+    cameras={"left": CameraSpec(16, 12, mount="left", depth=True, labels=True)},
+)  # fmt: skip
+CAMERA = calibration_of(SPEC, COURIER)
+WHOLE = ("Skid", "Mount", "Polyline", "Polygon", "MultiPolygon", "Pose", "Signal")
+"""Types whose parts the table names in words, if at all."""
+
+
+class Row(NamedTuple):
+    """An attribute as the table has it. types: of its value, any of these."""
+
+    path: str
+    asked: str
+    types: tuple[str, ...]
+    words: str
+
+
+def table() -> list[Row]:
+    """The README's table, a row for each attribute."""
+    lines = (ROOT / "README.md").read_text().partition("| of `observation` |")[2].partition("\n\n")[0].splitlines()[2:]
+    found = []
+    for line in lines:
+        named, asked, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
+        stated = tuple(types.split(" or ")) if " of " not in types else (types,)
+        found += [Row(path, asked, stated, words) for path in re.findall(r"`([^`]+)`", named)]
+    return found
+
+
+TABLE = table()
+
+
+def fits(value: Any, stated: str) -> bool:
+    """Whether a value is of the type that a cell of the table states."""
+    of = re.fullmatch(r"`(\w+)` of `(\w+)` to `(\w+)`", stated)
+    if of:
+        holds, key, item = of.groups()
+        pairs = [*value.items()] if isinstance(value, Mapping) else [(None, None)]
+        return fits(value, f"`{holds}`") and all(fits(k, f"`{key}`") and fits(v, f"`{item}`") for k, v in pairs)
+    array = re.fullmatch(r"`\((.*)\) (\w+)`", stated)
+    if array is None:
+        return stated == f"`{type(value).__name__}`".replace("NoneType", "None")
+    sides = [side.strip() for side in array[1].split(",") if side.strip()]
+    return (
+        isinstance(value, np.ndarray)
+        and value.dtype == array[2]
+        and value.ndim == len(sides)
+        and all(size == int(side) for size, side in zip(value.shape, sides, strict=True) if side.isdigit())
+    )
+
+
+def held(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Every public attribute below an observation, with its path: fields and properties, not methods. Those of a camera
+    stand in the table once."""
+    if isinstance(value, Mapping) and "signals" not in path and "mounts" not in path:
+        for name, item in value.items():
+            yield from held(item, f'{path}["{name}"]')
+        return
+    if dataclasses.is_dataclass(value):
+        names = [field.name for field in dataclasses.fields(value)]
+    elif isinstance(value, msgspec.Struct):
+        names = list(value.__struct_fields__)
+    elif isinstance(value, SimpleNamespace):
+        names = list(vars(value))
+    else:
+        return
+    names += [name for name, part in vars(type(value)).items() if isinstance(part, property) and name[0] != "_"]
+    for name in names:
+        below, part = f"{path}.{name}".removeprefix("."), getattr(value, name)
+        yield below, part
+        if type(part).__name__ not in WHOLE:
+            yield from held(part, "camera" if name == "camera" else below)
+
+
+def untrue(seen: Any, goal: str = "") -> list[str]:
+    """What of an observation is not in the table, or not of a type that it states. goal: by which protocol."""
+    found = []
+    for path, value in held(seen):
+        rows = [row for row in TABLE if row.path == path and (path != "goal" or f'goal="{goal}"' in row.asked)]
+        types = [stated for row in rows for stated in row.types]
+        if not any(fits(value, stated) for stated in types):
+            found.append(f"{path} is {value!r}, not {' or '.join(types)}")
+    return found
+
+
+def paths(seen: Any) -> set[str]:
+    return {path for path, _ in held(seen)}
+
+
+@pytest.fixture(scope="module")
+def seen() -> dict[str, Observation]:
+    """An observation by each goal protocol of a policy that asks for everything, by one of them among people."""
+    found = {}
+    for protocol in get_args(GoalProtocol):
+        scenario = small_scenario()
+        if protocol != "none":
+            scenario = msgspec.structs.replace(scenario, crowd=CrowdSpec(persons=0, vehicles=0), events=())
+        with Episode(scenario, ALL, EpisodeOptions(seed=1, goal=protocol, camera="bullet")) as episode:
+            episode.reset()
+            found[protocol] = episode.advance(Command(1.0, 0.0))
+    return found
+
+
+@pytest.mark.engine
+def test_the_table_has_every_attribute_of_an_observation(seen: dict[str, Observation]) -> None:
+    """By every goal protocol: each attribute is in the table with its type, and no other."""
+    for protocol, one in seen.items():
+        assert untrue(one, protocol) == []
+    assert {row.path for row in TABLE} == set().union(*map(paths, seen.values()))
+    assert {row.asked for row in TABLE if row.path == "goal"} == {f'`goal="{protocol}"`' for protocol in seen}
+    known = seen["none"].privileged
+    assert known is not None and len(known.people) > 3 and len(known.signals) > 0
+
+
+def test_who_asks_for_nothing_gets_none() -> None:
+    """What the table says is None without being asked for: the defaults of an observation."""
+    fields = {field.name: field.default for field in dataclasses.fields(Observation)}
+    absent = {row.path for row in TABLE if "`None`" in row.words and "." not in row.path} | {"depth", "labels"}
+    assert absent == {"rgb", "camera", "depth", "labels", "odometry", "privileged"}
+    assert all(fields[name] is None for name in absent - {"rgb"}) and fields["goal"] is None
+
+
+@pytest.mark.engine
+def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Observation]) -> None:
+    """Isolated and served policies get the same types; one without cosim the same names, but for those that the README
+    lists, and the same arrays of goals and odometry."""
+    readme = " ".join((ROOT / "README.md").read_text().split())
+    lacking = set(re.findall(r"`([\w.]+)`", readme.partition("but of these: ")[2].partition("Points, noise")[0]))
+    assert len(lacking) == 6
+    for protocol, one in seen.items():
+        afar, plain = hosted(one)
+        given = dataclasses.replace(one, privileged=None)
+        assert paths(afar) == paths(given) and paths(plain) == paths(given) - lacking
+        own = [line for line in untrue(plain, protocol) if "namespace(" not in line and "_Given(" not in line]
+        assert {*untrue(afar, protocol), *own} == {"privileged is None, not `Privileged`"}
+        for name in ("odometry", "goal"):
+            if name != "goal" or protocol not in ("none", "instruction"):
+                assert np.array_equal(getattr(plain, name), getattr(one, name))
+
+
+def hosted(seen: Observation) -> tuple[Observation, SimpleNamespace]:
+    """What a policy gets in another process with cosim, and in one without."""
+    told, array = told_goal(seen.goal)
+    arrays = arrays_of(seen) | ({} if array is None else {GOAL: array})
+    pose = None if seen.odometry is None else msgspec.structs.astuple(seen.odometry)
+    asked = AskAct("r", seen.episode, "a", 0, seen.tick, seen.time_s, seen.v_mps, seen.w_radps, seen.reset, told, pose)
+    asked = msgspec.msgpack.decode(msgspec.msgpack.encode(asked), type=AskAct)
+    about = told_about(seen)
+    return seen_from_afar(seen.episode, about, asked, arrays), _plain_observation(seen.episode, about, asked, arrays)
+
+
+def test_goals_and_odometry_are_arrays_for_numpy() -> None:
+    """A point is x and y, a pose x, y and heading, without one x and y; pictures and patches are their pixels; what is
+    no array says what to read. Equality, hashes and messages are those of the fields."""
+    point, pixels = PointGoal(3.0, -4.0), np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    assert np.asarray(point).tolist() == [3.0, -4.0] and np.asarray(point).dtype == float
+    assert np.asarray(point, np.float32).dtype == np.float32 and np.linalg.norm(point) == 5.0  # type: ignore[arg-type]
+    assert np.stack([point, point]).shape == (2, 2)  # type: ignore[call-overload]
+    assert np.asarray(Odometry(1.0, 2.0, 0.5)).tolist() == [1.0, 2.0, 0.5]
+    assert np.asarray(Odometry(1.0, 2.0, None)).tolist() == [1.0, 2.0]
+    for one in (ImageGoal(pixels), RoutePatch(pixels), CameraPicture(pixels, None, None, CAMERA)):
+        assert np.asarray(one) is pixels and np.asarray(one, np.float32).dtype == np.float32
+    for one, words in ((Instruction("Stop."), "read observation.goal.text"), (CAMERA, r"read .matrix \(3, 3\)")):
+        with pytest.raises(TypeError, match=words):
+            np.asarray(one)
+    assert point == PointGoal(3.0, -4.0) and hash(point) == hash(PointGoal(3.0, -4.0))
+    assert msgspec.json.encode(point) == b'{"type":"point","x_m":3.0,"y_m":-4.0}'
