@@ -6,20 +6,27 @@ Keys, below `cosim/<run>/env/<episode>/`: `inject`, `status`, `log` and `camera`
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
-from typing import Final
+from contextlib import suppress
+from typing import Any, Final, get_args, get_type_hints
 
 import msgspec
 
 from bridge.session import Session
 from cosim.core.errors import EngineError, SpecError
-from cosim.spec.injection import Ack, Injection
+from cosim.spec.injection import POINT_FORMS, Ack, InjectionRequest
 
 LARGEST_B: Final = 64 * 1024
 """Longer injections are refused unread."""
+_MOST_SHOWN: Final = 60
+"""Characters of a wrong value that an error shows."""
 _JSON_BEGINS: Final = b"{[ \t\r\n"
+_PLACE: Final = re.compile(r"at `\$([^`]*)`")
+_STEP: Final = re.compile(r"\.(\w+)|\[(\d+)\]")
+_OF_PATH: Final = re.compile(r"path\b|`(ahead|left)`")
 
-Offer = Callable[[Injection], Ack]
+Offer = Callable[[InjectionRequest], Ack]
 
 
 def serve_injections(session: Session, key: str, offer: Offer) -> None:
@@ -36,11 +43,39 @@ def answer_to(payload: bytes, offer: Offer) -> Ack:
     if len(payload) > LARGEST_B:
         return Ack(id="", status="refused", reason=f"{len(payload)} bytes: a message has at most {LARGEST_B}")
     try:
-        decode = msgspec.json.decode if payload[:1] in _JSON_BEGINS else msgspec.msgpack.decode
-        return offer(decode(payload, type=Injection))
+        return offer(_decoder(payload)(payload, type=InjectionRequest))
     except (msgspec.DecodeError, RecursionError, ValueError, SpecError) as error:
-        unknown = f". Valid choices: {', '.join(Injection.__struct_fields__)}" if "unknown field" in str(error) else ""
-        return Ack(id="", status="refused", reason=f"{error}{unknown}")
+        words = str(error)
+        return Ack(id="", status="refused", reason=f"{words}{_found(payload, words)}{_choices(words)}")
+
+
+def _found(payload: bytes, error: str) -> str:
+    """The value at the place that an error names; "" where the error shows it or names no place."""
+    place = _PLACE.search(error)
+    if place is None or not error.startswith("Expected") or ", got " in error:
+        return ""
+    with suppress(msgspec.DecodeError, RecursionError, LookupError, TypeError, ValueError):
+        value = _decoder(payload)(payload)
+        for field, index in _STEP.findall(place[1]):
+            value = value[field] if field else value[int(index)]
+        return f", found {repr(value)[:_MOST_SHOWN]}"
+    return ""
+
+
+def _choices(error: str) -> str:
+    """The valid choices for the field that an error is about; "" where there are none to list."""
+    if "unknown field" in error and "$.path" not in error:
+        valid: tuple[str, ...] = InjectionRequest.__struct_fields__
+    elif error.startswith("Invalid enum") and (place := _PLACE.search(error)) is not None:
+        valid = get_args(get_type_hints(InjectionRequest).get(place[1].removeprefix("."), None))
+    else:
+        valid = ()
+    words = f". Valid choices: {', '.join(valid)}" if valid else ""
+    return words + (f"; {POINT_FORMS}" if _OF_PATH.search(error) else "")
+
+
+def _decoder(payload: bytes) -> Callable[..., Any]:
+    return msgspec.json.decode if payload[:1] in _JSON_BEGINS else msgspec.msgpack.decode
 
 
 def _encoded(ack: Ack, *, as_json: bool) -> bytes:

@@ -1,8 +1,14 @@
-"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs substeps."""
+"""Integer time. A tick is one step of the crowd; the policy acts every few ticks; physics runs substeps.
+
+The simulation never reads a wall clock; a `Pacer` can hold it back to one.
+"""
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Final
 
 from cosim.core.errors import SpecError
 
@@ -62,3 +68,31 @@ class Clock:
     def acts(self, tick: int) -> bool:
         """Whether the policy is asked at `tick`."""
         return tick % (self.policy_ms // self.tick_ms) == 0
+
+
+class Pacer:
+    """Holds a simulation back to a multiple of real time.
+
+    pace: simulated seconds for each second of the wall clock. clock, sleep: that wall clock, and how to wait, in
+    seconds.
+    """
+
+    CATCH_UP_S: Final = 1.0
+    """A simulation that fell behind, because a policy thought or the machine was busy, makes up for so much at most."""
+
+    def __init__(
+        self,
+        pace: float,
+        clock: Callable[[], float] = time.monotonic,
+        sleep: Callable[[float], None] = time.sleep,
+    ) -> None:
+        self._pace, self._clock, self._sleep = pace, clock, sleep
+        self._due_s: float | None = None
+
+    def wait(self, simulated_s: float) -> None:
+        """Wait until so many more simulated seconds may be over."""
+        now_s = self._clock()
+        due_s = now_s if self._due_s is None else self._due_s
+        self._due_s = max(due_s + simulated_s / self._pace, now_s - self.CATCH_UP_S)
+        if self._due_s > now_s:
+            self._sleep(self._due_s - now_s)

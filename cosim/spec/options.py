@@ -37,6 +37,10 @@ class RendererAt(msgspec.Struct, frozen=True, kw_only=True):
     asks: bool
 
 
+LEAST_PACE, MOST_PACE = 0.1, 100.0
+"""Times real time: the range of a pace. Slower ones would look like an engine that hangs."""
+
+
 class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     """How an episode is run. But for robot, latency and the noise of collecting, options change what is seen and kept,
     never what happens in the street.
@@ -48,7 +52,8 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     that the scenario is of, of the file of the policy, and where that runs, for the record. own_camera: the policy may
     see by a camera that the robot does not have (`cosim.episode.camera_rules`), which marks the record as nonstandard.
     camera: what draws pictures. frames_every_s: keep a camera frame every so many seconds, 0 for none. live: where it
-    is on the air meanwhile. director: where its event pedestrians are decided, when not beside it. counterfactual:
+    is on the air meanwhile. pace: the simulation waits for the wall clock, to run at most so many times faster than
+    real time; 0: it never waits. director: where its event pedestrians are decided, when not beside it. counterfactual:
     compare it with its street without the robot. injections: pedestrians that were injected into the episode that this
     one replays. renderer: what draws for the policy in place of a camera of its own. latency_ms: each command takes
     effect so much later than the observation that it answers, rounded up to ticks of 50 ms (`cosim.episode.in_flight`).
@@ -71,6 +76,7 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
     camera: CameraChoice = "auto"
     frames_every_s: float = 0.0
     live: Live | None = None
+    pace: float = 0.0
     director: Outside | None = None
     counterfactual: bool = False
     injections: tuple[Injected, ...] = ()
@@ -83,5 +89,10 @@ class EpisodeOptions(msgspec.Struct, frozen=True, kw_only=True):
         check_seed(self.seed)
         if not (math.isfinite(self.latency_ms) and 0.0 <= self.latency_ms <= MOST_LATENCY_MS):
             raise UsageError(f"latency_ms must be from 0 to {MOST_LATENCY_MS:g} ms, not {self.latency_ms:g}")
+        if self.pace and not LEAST_PACE <= self.pace <= MOST_PACE:
+            raise UsageError(
+                f"pace must be from {LEAST_PACE:g} to {MOST_PACE:g} times real time, or 0 for as fast as possible, "
+                f"not {self.pace:g}"
+            )
         if self.real_time and self.latency_ms:
             raise UsageError("real_time measures the latency of every answer: leave latency_ms out")

@@ -23,7 +23,7 @@ from typing import Self
 
 import msgspec
 
-from cosim.core.clock import Clock
+from cosim.core.clock import Clock, Pacer
 from cosim.core.errors import EngineError, PolicyError, UsageError
 from cosim.core.state import Frame
 from cosim.episode.camera_rules import check_camera
@@ -133,6 +133,9 @@ class Episode:
             if self.options.live is not None:
                 air = stack.enter_context(OnAir(self.options.live, self.scenario, stage.injected))
                 self._watches.append(air.tell)
+            if self.options.pace:
+                pacer = Pacer(self.options.pace)
+                self._watches.append(lambda step, verdict: pacer.wait(self.clock.tick_s))
             self._stack = stack.pop_all()
         self._stage, self._scorer, self._injected = stage, stage.scorer, stage.injected
         self.record = msgspec.structs.replace(self.record, renderer=stage.renderer)

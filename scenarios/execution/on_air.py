@@ -19,7 +19,7 @@ from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.spec.injection import Injected, Live
 from cosim.spec.scenario import Scenario
-from scenarios.execution.injected import InjectedPeople
+from scenarios.execution.injected import InjectedPeople, RobotOnRoute
 
 
 class _Told(msgspec.Struct, frozen=True, kw_only=True):
@@ -57,6 +57,10 @@ class OnAir:
     def tell(self, step: Step, verdict: Verdict) -> None:
         """Tell everybody what this tick did."""
         self._step = step
+        pose, route_s_m = step.motion.robot.pose, step.route_s_after_m
+        if verdict.reset is not None:
+            pose, route_s_m = verdict.reset.pose, verdict.reset.route_s_m
+        self._injected.robot_at(RobotOnRoute(step.tick + 1, pose, route_s_m))
         if step.frame is not None:
             self._rgb = step.frame.rgb
         tick, street, robot = step.tick, step.street_after, step.motion.robot

@@ -71,18 +71,25 @@ class Estimate(NamedTuple):
     basis: str
 
 
-def announcement(scenarios: Sequence[Scenario], policy: str, renderer: str, jobs: int, compared: bool) -> str:
-    """What a run comes to, in one line: episodes, way, simulated time at most, about how long it takes here."""
+def announcement(
+    scenarios: Sequence[Scenario], policy: str, renderer: str, jobs: int, compared: bool, pace: float = 0.0
+) -> str:
+    """What a run comes to, in one line: episodes, way, simulated time at most, about how long it takes here. pace: see
+    `cosim.spec.options.EpisodeOptions`."""
     known, cores = recall(), len(os.sched_getaffinity(0))
-    here = estimate(scenarios, known, policy, renderer, jobs, compared, cores)
+
+    def taken(jobs: int) -> Estimate:
+        free = estimate(scenarios, known, policy, renderer, jobs, compared, cores)
+        return paced(free, scenarios, known, policy, jobs, pace) if pace else free
+
+    here = taken(jobs)
     far_m = sum(s.route_line.length_m for s in scenarios)
     far = f"{far_m / 1000.0:.1f} km" if far_m >= 1000.0 else f"{far_m:.0f} m"
     most_s = sum(s.time_limit_s for s in scenarios)
     words = f"{_episodes(len(scenarios))}, {far} of route, at most {duration(most_s)} of simulated time. "
     words += f"About {span(here)} with --jobs {jobs}"
     if jobs < (most := min(cores, len(scenarios))):
-        with_more = estimate(scenarios, known, policy, renderer, most, compared, cores)
-        words += f", {span(with_more)} with --jobs {most}"
+        words += f", {span(taken(most))} with --jobs {most}"
     return f"{words}: {here.basis}."
 
 
@@ -127,6 +134,30 @@ def estimate(
     stuck_s = taken_s([], [s.time_limit_s / slow for s in scenarios])[1]
     basis += f"; up to {duration(stuck_s)} if it stands still, longer if it thinks long"
     return Estimate(*taken_s(low_s, high_s), basis)
+
+
+def paced(
+    free: Estimate, scenarios: Sequence[Scenario], known: Sequence[Measured], policy: str, jobs: int, pace: float
+) -> Estimate:
+    """How long the same takes where episodes are held to `pace` times real time. free: how long it takes where they are
+    not."""
+    short = all(s.ends_on_failure for s in scenarios)
+    same = [m for m in known if (m.policy, m.short) == (policy, short)][-RECENT:]
+    if len(same) >= ENOUGH:
+        rates = _around([m.simulated_s / m.route_m for m in same])
+        basis = f"as fast as {_episodes(len(same))} of '{policy}' on this machine drove, "
+    else:
+        rates = (1.0 / DRIVES_MPS[1], 1.0 / DRIVES_MPS[0])
+        basis = f"the policy is taken to drive at {DRIVES_MPS[0]:g} to {DRIVES_MPS[1]:g} m/s, "
+    low_s, high_s = (
+        makespan([setup_s + rate * s.route_line.length_m / pace for s in scenarios], jobs)
+        for setup_s, rate in zip(SETS_UP_S, rates, strict=True)
+    )
+    if low_s <= free.low_s and high_s <= free.high_s:
+        return free
+    stuck_s = makespan([s.time_limit_s / pace for s in scenarios], jobs)
+    basis += f"held to {pace:g} x real time; up to {duration(stuck_s)} if it stands still, longer if it thinks long"
+    return Estimate(max(low_s, free.low_s), max(high_s, free.high_s), basis)
 
 
 def makespan(taken_s: Sequence[float], slots: int) -> float:

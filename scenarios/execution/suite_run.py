@@ -94,7 +94,10 @@ def run(
     if on:
         from scenarios.many.on_ray import by_ray, check_on_ray
 
-        of_here = {"shared_renderer": shared_renderer, "real_time": options.real_time, "live": options.live}
+        of_here = {
+            "shared_renderer": shared_renderer, "real_time": options.real_time, "live": options.live,
+            "pace": options.pace,
+        }  # fmt: skip
         check_on_ray(on, of_here)
     whole = with_robot(load_suite(suite) if isinstance(suite, str) else suite, options.robot)
     of_run = scenarios_chosen(whole, scenarios, episodes, events)

@@ -113,7 +113,10 @@ def staged(
             from scenarios.residents.director import among_residents  # with what draws their graph
 
             director = among_residents(director, scenario, street_map, street, lambda: crowd.street.people)
-        injected = InjectedPeople(director, clock.tick_ms, partial(on_map, street_map), options.injections)
+        injected = InjectedPeople(
+            director, clock.tick_ms, partial(on_map, street_map), scenario.route_line, scenario.start_pose,
+            options.injections,
+        )  # fmt: skip
         directed: Director = injected
         if scenario.obstacles:
             directed = AmongObstacles(injected, standing_in(scenario, street_map), lambda: crowd.street.people)

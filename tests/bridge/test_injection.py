@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import msgspec
@@ -18,11 +19,15 @@ import pytest
 
 from bridge.live import LARGEST_B, answer_to
 from bridge.security.authority import issue, make_authority
+from cosim.core.geometry import Polyline, Pose
+from cosim.episode.log import Log
+from cosim.episode.ports import Director
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventQuery, EventReply
-from cosim.spec.injection import Ack, Injected, Injection
+from cosim.spec.injection import Ack, Injected, Injection, InjectionRequest, RelativePoint
 from cosim.spec.scenario import City, CrowdSpec, Suite, write_suite
-from scenarios.execution.injected import MOST_INJECTED, InjectedPeople
+from scenarios.execution import injected
+from scenarios.execution.injected import MOST_INJECTED, InjectedPeople, RobotOnRoute
 from tests.bridge.security.plain import free_port
 from tests.conftest import PATIENCE_S, Cosim
 
@@ -36,9 +41,17 @@ class Nobody:
         return EventReply(episode=query.episode, tick=query.tick, states=(), actors=())
 
 
-def injected_people(*script: Injected) -> InjectedPeople:
-    """Injected people on a map that is the square of 100 m at the origin."""
-    return InjectedPeople(Nobody(), TICK_MS, lambda x, y: 0.0 <= x <= 100.0 and 0.0 <= y <= 100.0, script)
+ROUTE = Polyline([(90.0, 90.0), (90.0, 50.0), (10.0, 50.0)])
+START = Pose(90.0, 90.0, -math.pi / 2)
+
+
+def injected_people(*script: Injected, director: Director | None = None) -> InjectedPeople:
+    """Injected people on a map that is the square of 100 m at the origin, along ROUTE."""
+
+    def on_map(x_m: float, y_m: float) -> bool:
+        return 0.0 <= x_m <= 100.0 and 0.0 <= y_m <= 100.0
+
+    return InjectedPeople(director or Nobody(), TICK_MS, on_map, ROUTE, START, script)
 
 
 def query(tick: int, robot_x_m: float = 90.0) -> EventQuery:
@@ -59,7 +72,7 @@ def test_an_injected_person_enters_at_the_tick_it_was_told_walks_its_path_and_le
     for tick in range(3):
         assert not one.react(query(tick)).actors
     ack = one.offer(anna(doing="look"))
-    assert ack == Ack(id="anna", status="accepted", tick=3, time_s=0.15)
+    assert ack == Ack(id="anna", status="accepted", tick=3, time_s=0.15, x_m=10.0, y_m=10.0)
     seen = {tick: one.react(query(tick)).actors for tick in range(3, 80)}
     assert (seen[3][0].id, seen[3][0].x_m, seen[3][0].y_m) == ("ei-anna", 10.0, 10.0)
     assert seen[23][0].x_m == pytest.approx(11.5) and seen[23][0].speed_mps == pytest.approx(1.5)
@@ -100,6 +113,75 @@ def test_the_log_alone_replays_the_injected_people() -> None:
     assert [entry.tick for entry in live.log] == [4, 20]
 
 
+def test_points_from_the_robot_are_taken_where_it_is_when_the_pedestrian_enters() -> None:
+    """Ahead and left of its pose at that tick, beside points of the map; the log holds the map's alone, and replays."""
+    one, robot = injected_people(), Pose(50.0, 50.0, math.pi / 2)
+    one.react(query(0))
+    one.robot_at(RobotOnRoute(1, robot, 40.0))
+    ack = answer_to(b'{"id":"a","path":[{"ahead":15,"left":1},[60,60],{"ahead":-2.5}]}', one.offer)
+    assert (ack.status, ack.tick, ack.x_m, ack.y_m) == ("accepted", 1, pytest.approx(49.0), pytest.approx(65.0))
+    shown = [one.react(query(tick)).actors for tick in range(1, 100)]
+    (entry,) = msgspec.json.decode(msgspec.json.encode(one.log), type=tuple[Injected, ...])
+    path = [(49.0, 65.0), (60.0, 60.0), (50.0, 47.5)]
+    assert [number for point in entry.injection.path for number in point] == pytest.approx(sum(path, ()))
+    again = injected_people(entry)
+    again.react(query(0))
+    assert [again.react(query(tick)).actors for tick in range(1, 100)] == shown
+
+
+def test_points_from_the_robot_wait_for_the_tick_under_way() -> None:
+    """Offered in the middle of a tick the pedestrian enters at the next one, and ahead of the robot as it is then."""
+    acks: list[Ack] = []
+    here = InjectionRequest(id="a", path=(RelativePoint(10.0),))
+
+    class Busy(Nobody):
+        def react(self, query: EventQuery) -> EventReply:
+            offering.start()
+            return super().react(query)
+
+    one = injected_people(director=Busy())
+    offering = Thread(target=lambda: acks.append(one.offer(here)))
+    one.react(query(0))
+    assert not acks
+    one.robot_at(RobotOnRoute(1, Pose(20.0, 30.0, 0.0), 40.0))
+    offering.join(PATIENCE_S)
+    assert acks == [Ack(id="a", status="accepted", tick=1, time_s=0.05, x_m=30.0, y_m=30.0)]
+
+
+def test_a_tick_that_does_not_end_refuses_points_from_the_robot(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An engine that hangs holds no client up: points of the map are taken, the others are to be sent again."""
+    monkeypatch.setattr(injected, "SETTLES_S", 0.01)
+    one = injected_people()
+    one.react(query(0))
+    ack = one.offer(InjectionRequest(id="a", path=(RelativePoint(10.0),)))
+    assert ack.status == "refused" and "send it again" in ack.reason
+    assert one.offer(anna()).status == "accepted"
+
+
+@pytest.mark.parametrize(
+    "robot",
+    [(90.0, 90.0, -1.6, 0.0), (88.0, 52.0, -3.0, 39.0), (11.0, 49.0, 2.0, 119.0)],
+    ids=["start", "turn", "goal"],
+)
+@pytest.mark.parametrize(
+    "path", ["[[10,10],[170,252]]", '[[10,10],{"ahead":-3,"left":-200}]'], ids=["of the map", "from the robot"]
+)
+def test_a_refusal_says_where_the_robot_is_and_a_point_that_is_taken(
+    robot: tuple[float, float, float, float], path: str
+) -> None:
+    """At the start, in a turn and near the goal: the message with either form of the point in it is accepted."""
+    one = injected_people()
+    one.robot_at(RobotOnRoute(0, Pose(*robot[:3]), robot[3]))
+    reason = answer_to(f'{{"id":"a","path":{path}}}'.encode(), one.offer).reason
+    assert reason.startswith("path[1] is ") and "not on this map" in reason
+    assert f"The robot is at [{robot[0]:.1f}, {robot[1]:.1f}]" in reason
+    found = re.search(r"A valid point on its route is (\[.*?\]), or (\{.*?\}) from the robot", reason)
+    assert found is not None
+    acks = [answer_to(f'{{"id":"p{i}","path":[{found[i]}]}}'.encode(), one.offer) for i in (1, 2)]
+    assert [ack.status for ack in acks] == ["accepted", "accepted"]
+    assert math.dist((acks[0].x_m or 0.0, acks[0].y_m or 0.0), (acks[1].x_m or 0.0, acks[1].y_m or 0.0)) < 0.2
+
+
 @pytest.mark.parametrize(
     ("message", "reason"),
     [
@@ -112,12 +194,20 @@ def test_the_log_alone_replays_the_injected_people() -> None:
         (b'{"id":"a","path":[[1,NaN]]}', "malformed"),
         (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("nan")]]}), "no number"),
         (msgspec.msgpack.encode({"id": "a", "path": [[1.0, float("inf")]]}), "no number"),
+        (b'{"id":"a","path":[{"forward":15}]}', "field `forward` - at `$.path[0]`; a point is [x, y] on the map or {"),
+        (b'{"id":"a","ahead":15}', "`ahead`. Valid choices: id, path, speed_mps, heading_rad, doing, age, stay_s; a"),
+        (b'{"id":"a","path":[{"left":1}]}', "missing required field `ahead` - at `$.path[0]`; a point is"),
+        (b'{"id":"a","path":[{"ahead":1e9}]}', "<= 1000.0 - at `$.path[0].ahead`, found 1000000000.0; a point is"),
+        (b'{"id":"a","path":[[1,2,3]]}', "`array` of length 2 - at `$.path[0]`, found [1, 2, 3]; a point is"),
+        (msgspec.msgpack.encode({"id": "a", "path": [{"ahead": float("nan")}]}), "found nan; a point is"),
+        (b'{"id":"a","path":[[1,1]],"doing":"dance"}', "'dance' - at `$.doing`. Valid choices: walk, stand, look"),
         (b"\x93\x01", ""),
         (b"[" * 60_000, ""),
         (b"x" * (LARGEST_B + 1), f"at most {LARGEST_B}"),
         (b"", ""),
     ],
     ids=["fast", "off the map", "no path", "no name", "misspelt", "negative stay", "nan", "packed nan", "packed inf",
+         "misspelt point", "point without a path", "half a point", "far", "three numbers", "relative nan", "dance",
          "cut short", "deep", "large", "empty"],
 )  # fmt: skip
 def test_a_message_that_makes_no_sense_is_refused_in_words(message: bytes, reason: str) -> None:
@@ -156,7 +246,7 @@ def test_those_who_enter_count_while_the_director_is_asked() -> None:
             acks.append(one.offer(anna(id="late")))
             return super().react(query)
 
-    one = InjectedPeople(Slow(), TICK_MS, lambda x, y: True)
+    one = injected_people(director=Slow())
     assert all(one.offer(anna(id=f"p{i}")).status == "accepted" for i in range(MOST_INJECTED))
     assert len(one.react(query(0)).actors) == MOST_INJECTED
     assert acks[0].status == "refused" and "are here already" in acks[0].reason
@@ -304,7 +394,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     viewer, injector = (("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector"))  # type: ignore[arg-type]
     with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
         there = ("--connect", air.at, "--wait", str(PATIENCE_S))
-        message = json.dumps({"id": "anna", "path": [air.way[0], air.way[-1]], "doing": "stop"})
+        message = json.dumps({"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"})
         sent = cosim("inject", message, *there, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
         again = cosim("inject", message, *there, *injector)
@@ -331,7 +421,11 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
                 listener.stdout.close()
             assert listener.returncode == code and all("x_m" in tick for tick in ticks), ends
         record = air.record()
-    assert record["status"] == "done" and record["injections"][0]["injection"]["id"] == "anna"
+    (entry,) = record["injections"]
+    assert record["status"] == "done" and entry["injection"]["id"] == "anna"
+    log = Log.load(tmp_path / "run" / "episodes" / "t-0" / "trajectory.npz")
+    robot = Pose(*log.pose[entry["tick"] - 1])
+    assert entry["injection"]["path"] == [list(air.way[0]), list(RelativePoint(4.0, 0.5).on_map(robot))]
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
     assert "replaying t-0 ..." in replayed.stderr
@@ -349,7 +443,6 @@ def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, c
     assert found is not None
     with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
         script = found[1].replace("tcp/127.0.0.1:7447", air.at)
-        script = script.replace("[170, 252], [190, 252]", json.dumps([air.way[0], air.way[-1]])[1:-1])
         (tmp_path / "ten.py").write_text(script)
         assert cosim("listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0").returncode == 0
         bob = json.loads(air.python("ten.py").stdout)

@@ -9,7 +9,13 @@ from tests.conftest import Cosim
 
 def test_what_is_of_one_machine_is_refused_in_words(cosim: Cosim, tmp_path: Path) -> None:
     """Before anything is loaded, listened to or written; its help does not offer it."""
-    for words in (("--shared-renderer",), ("--real-time",), ("--live", "tcp/127.0.0.1:7448"), ("--director", "x")):
+    for words in (
+        ("--shared-renderer",),
+        ("--real-time",),
+        ("--pace", "1"),
+        ("--live", "tcp/127.0.0.1:7448"),
+        ("--director", "x"),
+    ):
         said = cosim("coordinator", "reactive", *words, cwd=tmp_path)
         assert said.returncode == 2 and f"{words[0]} is of one machine" in said.stderr, said.stderr
         assert "leave it out, or use `cosim run`" in said.stderr

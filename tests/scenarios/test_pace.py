@@ -81,6 +81,20 @@ def test_two_processes_take_about_half_and_ten_on_two_cores_no_less() -> None:
     assert makespan([], 2) == 0.0
 
 
+@pytest.mark.parametrize("known", [[], episodes(5)], ids=["unknown", "measured"])
+@pytest.mark.parametrize("pace_x", [1.0, 2.0])
+def test_what_is_held_to_real_time_takes_that_time(known: list[Measured], pace_x: float) -> None:
+    """At 0.75 s a metre 12 episodes of 4.8 km take an hour of real time, whatever the machine can do.
+
+    Two processes take half of that, and four on two cores a quarter, as they wait."""
+    for jobs in (1, 2, 4):
+        true_s = makespan([0.75 * s.route_line.length_m / pace_x for s in LONG], jobs)
+        found = pace.paced(of(known, jobs=jobs), LONG, known, "route", jobs, pace_x)
+        assert found.low_s < 1.1 * true_s and 0.9 * true_s < found.high_s < 3.0 * true_s
+        assert f"held to {pace_x:g} x real time" in found.basis
+    assert pace.paced(of(known), LONG, known, "route", 1, 100.0) == of(known)
+
+
 def test_the_line_says_episodes_way_limit_and_time() -> None:
     """One line: 12 episodes of 4.8 km, 6 h 40 min simulated at most, with one process and with as many as cores."""
     line = announcement(LONG, "route", GL, 1, False)

@@ -37,8 +37,9 @@ Wait = Annotated[
 @live_app.command(
     rich_help_panel=STEP_IN,
     epilog="Examples:  \n"
-    '`cosim inject \'{"id": "anna", "path": [[170, 252], [190, 252]], "speed_mps": 1.2}\'`  \n'
-    "`cosim inject @anna.json --env mine/lh-011-00 --wait 60`",
+    '`cosim inject \'{"id": "carl", "path": [{"ahead": 15, "left": 1}]}\'`  \n'
+    '`cosim inject \'{"id": "dora", "path": [{"ahead": 15}, {"ahead": 3}]}\'`  \n'
+    "`cosim inject @pedestrian.json --wait 60`",
 )
 def inject(
     message: Annotated[str, typer.Argument(help="The pedestrian as JSON, @FILE, or - for standard input.")],
@@ -48,7 +49,12 @@ def inject(
     tls: Tls = "",
     insecure: Insecure = False,
 ) -> None:
-    """Inject a pedestrian into a running episode. Prints the tick at which it takes effect. Exit code 2: refused."""
+    """Inject a pedestrian into a running episode. Prints the tick at which it enters, and where. Exit code 2: refused.
+
+    It appears at the first point of its `path`, walks along it, stays at the end for `stay_s` (30) seconds, and leaves.
+    A point is `[x, y]` on the map, or `{"ahead": 15, "left": 1}` from the robot as it is at that tick, in metres.
+    Negative values mean behind it and to its right. Further fields: `speed_mps`, `heading_rad`, `doing`, `age`.
+    """
     from bridge.live import send_injection as send
 
     payload = _payload(message)
@@ -58,7 +64,8 @@ def inject(
     if ack.status == "refused":
         err.print(f"refused: {ack.reason}", soft_wrap=True, markup=False, highlight=False)
         raise typer.Exit(WRONG_USE)
-    out.print(f"'{ack.id}' enters at tick {ack.tick}, {ack.time_s:.2f} s", highlight=False)
+    where = "" if ack.x_m is None else f", at [{ack.x_m:.1f}, {ack.y_m:.1f}]"
+    out.print(f"'{ack.id}' enters at tick {ack.tick}, {ack.time_s:.2f} s{where}", markup=False, highlight=False)
 
 
 @live_app.command(

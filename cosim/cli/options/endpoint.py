@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,6 +16,8 @@ from cosim.spec.connection import Connection, Role, checked_endpoint
 DEFAULT = "tcp/127.0.0.1:7447"
 DIRECTOR = "tcp/127.0.0.1:7448"
 POLICIES_AT = "tcp/127.0.0.1:7449"
+EVERY_ADDRESS = {"0.0.0.0": "127.0.0.1", "[::]": "[::1]"}
+"""What stands for all addresses of a machine, and by what it reaches itself."""
 LONGEST_WAIT_S = 240.0
 """For a director: an environment process that says nothing for much longer is taken to hang
 (`scenarios.execution.pool`)."""
@@ -52,6 +56,27 @@ def ends_of_run(
         None if director is None else connecting("coordinator", "--director", director, files["--director"], insecure),
         tuple(connecting("coordinator", "--policy-at", end, files[name], insecure) for name, end in at.items()),
     )
+
+
+def reached_by(hub: Connection, role: Role) -> str:
+    """The options by which a command in this role reaches a hub from this machine, each after a space."""
+    protocol, _, address = hub.listen.partition("/")
+    host, _, port = address.rpartition(":")
+    if host in EVERY_ADDRESS:
+        address = f"{_certified(hub.tls) if hub.tls else EVERY_ADDRESS[host]}:{port}"
+    options = ["--connect", f"{protocol}/{address}"]
+    if hub.tls:
+        options += ["--tls", str(Path(hub.tls).parent / role)]
+    elif hub.insecure and not hub.of_this_machine and host not in EVERY_ADDRESS:
+        options += ["--insecure"]
+    return " " + shlex.join(options)
+
+
+def _certified(folder: str) -> str:
+    """The first name in the certificate of a hub, by which others must reach it."""
+    from bridge.security.identity import identity_in
+
+    return identity_in(Path(folder)).hosts[0]
 
 
 def warned(line: str) -> None:

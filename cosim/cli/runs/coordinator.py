@@ -25,6 +25,7 @@ coordinator_app = typer.Typer()
 _OF_ONE_MACHINE = {
     "shared_renderer": "workers draw for themselves",
     "live": "episodes run elsewhere",
+    "pace": "it is there to step in, and episodes run elsewhere",
     "director": "workers ask their own",
     "real_time": "answers are timed where nothing else runs",
 }

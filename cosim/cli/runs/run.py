@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
     from cosim.records.figures import Figures
+    from cosim.spec.connection import Connection
     from cosim.spec.scenario import Scenario, Split, Suite
     from scenarios.execution.transport import HeldRun
 
@@ -58,6 +59,10 @@ _OWN_CAMERA_HELP = "The policy may see by a camera that the robot does not have;
 _SHARD_HELP = "Run only every N-th scenario, from the I-th on; needs --seed. `cosim merge` makes one run of all N."
 _EVENT_HELP = "Run only scenarios of this event, or static: of none; may be repeated."
 _JOBS_HELP = "Environment processes; with --on as many as the cluster has CPUs."
+_PACE_HELP = (
+    "Hold it to so many times real time, from 0.1 to 100: with 1 there is time to step in by hand. The same results."
+)
+_STEPS_IN = '{"id": "eve", "path": [{"ahead": 15, "left": 1}]}'
 _ON_HELP = "Run by a Ray cluster: ray (of this machine), auto, or ray://HOST:10001. A policy of yours is sent there."
 _GOAL_HELP = "What the policy is told of where to go, by its name (`cosim list`), in place of what its manifest says."
 
@@ -98,6 +103,7 @@ def carry_out(
     live: Annotated[
         str | None, typer.Option(help="Be on the air at this endpoint, like tcp/127.0.0.1:7447: see `cosim inject`.")
     ] = None,
+    pace: Annotated[float, typer.Option(metavar="X", show_default="as fast as possible", help=_PACE_HELP)] = 0.0,
     director: Annotated[
         str | None, typer.Option(help="Ask the director at this endpoint, a process of its own: see `cosim direct`.")
     ] = None,
@@ -158,7 +164,7 @@ def carry_out(
     of_run = scenarios_chosen(whole, scenario or (), episodes, event or (), _split_called(split))
     options = EpisodeOptions(
         seed=seed, robot=robot, own_camera=own_camera, goal=goal_called(goal) if goal else None, camera=camera,
-        frames_every_s=frames, counterfactual=counterfactual, real_time=real_time,
+        frames_every_s=frames, counterfactual=counterfactual, real_time=real_time, pace=pace,
     )  # fmt: skip
     went_on = folder if resume else None
     plan = planned_run(
@@ -189,19 +195,20 @@ def carry_out(
             hub = stack.enter_context(open_session(air))
             on_air = msgspec.structs.replace(plan.options, live=Live(connection=hub.inside, run=named))
             plan = plan._replace(options=on_air)
-            err.print(f"On the air at {live}: see `cosim listen --help`.", soft_wrap=True, highlight=False)
         run = stack.enter_context(held_run(plan, path, resume=resume))
         done = {one.id for one in picked} - {one.id for one in run.todo}
         _tell_of_beginning(run, plan.options.seed)
         if run.todo and carrier is None:
-            words = announcement(run.todo, plan.policy, renderer, jobs, counterfactual)
+            words = announcement(run.todo, plan.policy, renderer, jobs, counterfactual, pace)
             err.print(words, soft_wrap=not err.is_terminal, highlight=False, markup=False)
-        board = Board(picked, done, compared=counterfactual)
+        if air is not None and run.todo:
+            _tell_how_to_step_in(air, named, run, several=jobs > 1, paced=pace > 0.0)
+        board = Board(picked, done, compared=counterfactual, pace=pace)
         go = Going(run.held.path, [s.id for s in run.todo], counts)
         try:
             with ExitStack() as running:
                 running.callback(go.end)
-                if carrier is None:
+                if carrier is None and not pace:  # what is held back says nothing of this machine
                     running.enter_context(remembered(run.held, run.todo, jobs))
                 running.enter_context(board.bars)
                 run_what_is_left(plan, run, reaches, board.tell)
@@ -253,6 +260,22 @@ def _tell_of_beginning(run: HeldRun, seed: int | None) -> None:
         err.print(f"{done} of {len(run.picked)} episodes are finished already.")
 
 
+def _tell_how_to_step_in(air: Connection, named: str, run: HeldRun, *, several: bool, paced: bool) -> None:
+    """Print the commands that listen and inject here. several: episodes at a time; then the first one is named."""
+    from bridge import keys
+    from cosim.cli.options.endpoint import reached_by
+    from cosim.spec.pseudonym import pseudonym_of
+
+    first = min(run.todo, key=partial(pseudonym_of, run.held.spec.seed))
+    env = f" --env {named}/{keys.chunk(first.id)}" if several else ""
+    say = partial(err.print, soft_wrap=True, markup=False, highlight=False)
+    say(f"On the air at {air.listen}. From another terminal:")
+    say(f"  cosim listen events{reached_by(air, 'viewer')}{env} --wait 60")
+    say(f"  cosim inject '{_STEPS_IN}'{reached_by(air, 'injector')}{env} --wait 60")
+    if not paced:
+        say("It runs as fast as it can. --pace 1 holds it to real time, so that there is time to step in.")
+
+
 def _tell_of_end(path: Path, table: DataFrame, of_run: Sequence[Scenario], figures: Figures | None) -> None:
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
 
@@ -295,7 +318,7 @@ def run_command(
     if on:
         from scenarios.many.on_ray import by_ray, check_on_ray
 
-        of_here = ("shared_renderer", "real_time", "live", "rerun")
+        of_here = ("shared_renderer", "real_time", "live", "pace", "rerun")
         check_on_ray(on, {f"--{name.replace('_', '-')}": asked[name] for name in of_here})
         say = partial(err.print, soft_wrap=True, highlight=False, markup=False)
         asked["carrier"] = by_ray(on, jobs, asked["policy"], say)

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 SETUP_M = 30.0
 """Starting an episode takes about as long as so many metres of its route."""
+PACED_SETUP_M = 3.0
+"""The same for each time real time that episodes are held to, as they take longer then and starting them does not."""
 ALONE = 0.74
 """Of an episode that is compared with its street without the robot, the share of the episode itself."""
 _SURE, _SURE_S = 0.02, 5.0
@@ -29,8 +31,8 @@ BAR = 12
 class Left:
     """How much of a run is left: its episodes weigh what their routes are long, and their starts."""
 
-    def __init__(self, lengths_m: Mapping[str, float]) -> None:
-        self._lengths_m = lengths_m
+    def __init__(self, lengths_m: Mapping[str, float], setup_m: float = SETUP_M) -> None:
+        self._lengths_m, self._setup_m = lengths_m, setup_m
         self._shares: dict[str, float] = {}
 
     def at(self, scenario: str, share: float) -> None:
@@ -42,8 +44,8 @@ class Left:
         """What of the run is done, 0 to 1."""
         if not self._lengths_m:
             return 1.0
-        done_m = fsum(SETUP_M + self._lengths_m[name] * share for name, share in self._shares.items())
-        return done_m / fsum(SETUP_M + length_m for length_m in self._lengths_m.values())
+        done_m = fsum(self._setup_m + self._lengths_m[name] * share for name, share in self._shares.items())
+        return done_m / fsum(self._setup_m + length_m for length_m in self._lengths_m.values())
 
     def seconds(self, since_s: float) -> float | None:
         """How long the rest takes, judged by the `since_s` seconds that the run took so far; None: too early to say."""
@@ -56,7 +58,7 @@ class Board:
     """The progress display of a run: one bar for all of it, one for each episode under way.
 
     done: ids of the scenarios that were finished before. compared: each episode is compared with its street without
-    the robot.
+    the robot. pace: episodes are held to so many times real time, 0 for none.
     """
 
     def __init__(
@@ -65,13 +67,15 @@ class Board:
         done: Set[str],
         *,
         compared: bool = False,
+        pace: float = 0.0,
         console: Console = err,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         text = ("{task.description}", "{task.fields[count]}", "{task.fields[note]}")
         name, count, note = (TextColumn(words, markup=False) for words in text)
         self.bars = Progress(name, BarColumn(BAR), count, note, TimeElapsedColumn(), console=console)
-        self.left = Left({s.id: s.route_line.length_m for s in scenarios if s.id not in done})
+        lengths_m = {s.id: s.route_line.length_m for s in scenarios if s.id not in done}
+        self.left = Left(lengths_m, min(SETUP_M, PACED_SETUP_M * pace) if pace else SETUP_M)
         self._scenarios = {s.id: s for s in scenarios}
         self._finished, self._alone = len(done), ALONE if compared else 1.0
         self._console, self._clock, self._began_s = console, clock, clock()

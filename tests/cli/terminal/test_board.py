@@ -88,6 +88,16 @@ def test_a_comparison_is_part_of_its_episode() -> None:
     assert (half_s := board.left.seconds(70.0)) is not None and half_s < at_goal_s / 1.5
 
 
+def test_a_run_that_is_held_to_real_time_is_judged_by_that() -> None:
+    """At --pace 1 starting an episode takes little of it: after 2 % of its way, and after 10 %, the rest is known."""
+    length_m = LONG[0].route_line.length_m
+    board, *_ = board_of(LONG[:1], pace=1.0)
+    for share in (0.02, 0.1):
+        board.tell(Progress(LONG[0].id, share * length_m, share * length_m, 0))
+        since_s, left_s = 4.0 + share * length_m, (1.0 - share) * length_m
+        assert board.left.seconds(since_s) == pytest.approx(left_s, rel=0.15)
+
+
 def test_a_run_with_nothing_left_to_do_is_all_done() -> None:
     """Resumed after its last episode: the bar is full."""
     board, *_ = board_of(LONG[:1], done=(LONG[0].id,))
