@@ -394,6 +394,13 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     viewer, injector = (("--tls", str(issue(certs, role, [], 1))) for role in ("viewer", "injector"))  # type: ignore[arg-type]
     with on_air(tmp_path, at, "--tls", "certs/coordinator") as air:
         there = ("--connect", air.at, "--wait", str(PATIENCE_S))
+
+        def log_on_air() -> dict[str, Any]:
+            told = cosim("listen", "events", *there, *viewer, "--seconds", "0")
+            assert told.returncode == 0, told
+            return dict(json.loads(told.stdout.splitlines()[0]))
+
+        once(lambda: log_on_air()["tick"] > 0)
         message = json.dumps({"id": "anna", "path": [air.way[0], {"ahead": 4, "left": 0.5}], "doing": "stop"})
         sent = cosim("inject", message, *there, *injector)
         assert sent.returncode == 0 and "'anna' enters at tick" in sent.stdout, sent.stderr
@@ -403,13 +410,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
         assert swapped.returncode == 2 and "is of the role viewer, and this needs injector" in swapped.stderr
         elsewhere = ("inject", message, "--connect", air.at, "--env", "run/t-9", *injector)
         once(lambda: "Valid choices: run/t-0" in (said := cosim(*elsewhere)).stderr and said.returncode == 2)
-
-        def in_the_log() -> list[str]:
-            told = cosim("listen", "events", *there, *viewer, "--seconds", "0")
-            assert told.returncode == 0, told
-            return [one["injection"]["id"] for one in json.loads(told.stdout.splitlines()[0])["injections"]]
-
-        once(lambda: in_the_log() == ["anna"])
+        once(lambda: [one["injection"]["id"] for one in log_on_air()["injections"]] == ["anna"])
         words = [sys.executable, "-m", "cosim", "listen", "robot", *there, *viewer]
         for ends, code in (("it is told to end", 130), ("nobody reads on", 141)):
             with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as listener:
@@ -425,6 +426,7 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
     assert record["status"] == "done" and entry["injection"]["id"] == "anna"
     log = Log.load(tmp_path / "run" / "episodes" / "t-0" / "trajectory.npz")
     robot = Pose(*log.pose[entry["tick"] - 1])
+    assert entry["tick"] > 0
     assert entry["injection"]["path"] == [list(air.way[0]), list(RelativePoint(4.0, 0.5).on_map(robot))]
     replayed = cosim("replay", "run", "t-0", cwd=tmp_path)
     assert replayed.returncode == 0 and record["state_hash"] in replayed.stdout, replayed.stderr
