@@ -19,6 +19,15 @@ _LATER = {"answers"} | _OF_PLANS
 """What a file need not have."""
 
 
+def holds_waypoints(path: Path) -> bool:
+    """Return whether a trajectory.npz has answers that were waypoints; False for a file that cannot be read."""
+    try:
+        with zipfile.ZipFile(path) as file:
+            return "plan_points.npy" in file.namelist()
+    except (OSError, zipfile.BadZipFile):
+        return False
+
+
 @dataclass(frozen=True)
 class Log:
     """An episode tick by tick, T rows; values at the end of each tick.

@@ -19,6 +19,8 @@ KEYS: tuple[str, ...] = (
     "rate_hz", "waypoints", "nonstandard", "goal_protocol", "odometry", "privileged", "latency_ms", "answer_ms",
     "real_time", "renderer", "ticks", "state_hash",
 )  # fmt: skip
+ORACLE = "orca"
+"""The policy that suites are proved by: it knows what no robot can, and its results are no contestant's."""
 BOOTSTRAP = 2000
 CONFIDENCE = 0.95
 WORST: Mapping[str, float] = {
@@ -53,6 +55,15 @@ def table_of(records: Iterable[Record]) -> pd.DataFrame:
     asked = [name for name in COUNTERFACTUAL if any(name in row for row in rows)]
     columns = [*KEYS, "metric_schema", "versions", *METRICS, *asked]
     return pd.DataFrame(rows, columns=columns)
+
+
+def policy_in_words(name: str, privileged: bool) -> str:
+    """A policy's name as tables show it, with what sets it apart from one that only sees.
+
+    >>> policy_in_words("orca", privileged=True)
+    'orca (oracle, privileged)'
+    """
+    return f"{name} ({'oracle, ' * (name == ORACLE)}privileged)" if privileged else name
 
 
 def summary_of(table: pd.DataFrame, names: Sequence[str] = tuple(METRICS)) -> pd.DataFrame:

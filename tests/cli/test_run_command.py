@@ -46,6 +46,8 @@ def test_a_policy_by_its_file_is_the_one_by_its_module(desk: Path, cosim: Cosim)
     by_file = ("run", suite, "--policy", "deeper/far.py:Far", "--isolated", "--out", out)
     said = cosim(*by_file, cwd=desk)
     assert said.returncode == 0, said.stderr
+    assert f"Next:\n  cosim film {out} --failure -o film.mp4\n  cosim report {out} -o report.html\n" in said.stderr
+    assert "policy far; at 4 Hz; goal route_point; odometry wheel; policy isolated; seed" in said.stdout
     assert json.loads((desk / "run/run.json").read_text())["policy"] == "far:Far"
     by_module = ("run", suite, "--policy", "far:Far", "--isolated", "--out", out, "--resume")
     again = cosim(*by_module, cwd=desk / "deeper")

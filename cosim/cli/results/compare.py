@@ -64,7 +64,7 @@ def print_comparison(out: Console, told: RunComparison) -> None:
 
     for run in (told.before, *told.others):
         out.print(f"{run.label}: {run.path}", soft_wrap=True, markup=False, highlight=False)
-        print_terms(out, run.table)
+        print_terms(out, run.table, run.path)
     for other in told.others:
         for table in tables_of_comparison(told, other):
             out.print(table.title, soft_wrap=True, markup=False, highlight=False)

@@ -63,7 +63,7 @@ def show(
         return
     if episode is None:
         table = table_of(records.values())
-        print_table(out, table, len(spec.scenarios))
+        print_table(out, table, len(spec.scenarios), folder)
         print_by_kind(out, table, kinds_of(folder))
         return
     if episode not in records:

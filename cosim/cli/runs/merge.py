@@ -36,7 +36,7 @@ def merge(
 
     with doing("reading the shards") as tell:
         merged = merge_runs(folders, target, tell)
-    print_table(out, merged.table, len(merged.spec.scenarios))
+    print_table(out, merged.table, len(merged.spec.scenarios), target)
     print_by_kind(out, merged.table, kinds_of(target))
     out.print(f"Run folder: {target}", soft_wrap=True)
     if merged.twice:

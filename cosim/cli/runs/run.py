@@ -277,13 +277,15 @@ def _tell_how_to_step_in(air: Connection, named: str, run: HeldRun, *, several: 
 
 
 def _tell_of_end(path: Path, table: DataFrame, of_run: Sequence[Scenario], figures: Figures | None) -> None:
+    from cosim.cli.terminal.next_commands import print_next_commands
     from cosim.cli.terminal.run_table import kinds_of, print_by_kind, print_table
 
-    print_table(out, table, len(of_run))
+    print_table(out, table, len(of_run), path)
     print_by_kind(out, table, kinds_of(path))
     if figures is not None:
         err.print(figures.in_words, soft_wrap=True, highlight=False)
     out.print(f"Run folder: {path}", soft_wrap=True)
+    print_next_commands(err, path, table)
 
 
 @run_app.command(

@@ -37,6 +37,7 @@ def print_names(out: Console) -> None:
     from cosim.policies.follow.networks import weights_in_words
     from cosim.policies.follow.policy import Follow
     from cosim.policies.shipped import bundle_in_words, shipped_bundles
+    from cosim.records.results import policy_in_words
     from cosim.spec.goal import GOALS
     from cosim.spec.robot import ROBOTS
     from scenarios.catalog import SUITES, load_suite
@@ -50,7 +51,8 @@ def print_names(out: Console) -> None:
         for name, mount in one.mounts.items():
             out.print(f"camera  {one.name} {name}  {mount.in_words}", soft_wrap=True)
     for name, make in POLICIES.items():
-        out.print(f"policy  {name}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
+        called = policy_in_words(name, make().manifest.privileged)
+        out.print(f"policy  {called}  {(make.__doc__ or '').splitlines()[0]}", soft_wrap=True)
     for name, folder in shipped_bundles().items():
         out.print(f"policy  {name}  {bundle_in_words(folder)}", soft_wrap=True)
     about = (Follow.__doc__ or "").splitlines()[0]

@@ -247,6 +247,7 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
     """What came out of a run; of a sweep by its values, which are written beside it."""
     import pandas as pd
 
+    from cosim.cli.terminal.next_commands import print_next_commands
     from cosim.cli.terminal.run_table import print_statuses, print_table
     from scenarios.own.sweep import summary_of_sweep, write_sweep
 
@@ -261,8 +262,10 @@ def _print_run(own: OwnFile, tables: Sequence[pd.DataFrame], path: Path) -> None
         except MachineError as error:
             err.print(str(error), soft_wrap=True, markup=False, highlight=False)
     else:
-        print_table(out, table, len(own.variants))
+        print_table(out, table, len(own.variants), path)
     out.print(f"Run folder: {path}", soft_wrap=True)
+    if len(tables) == 1:  # else each goal has a run in a folder of its own
+        print_next_commands(err, path, table)
     if table["ended"].isna().any():
         raise typer.Exit(SOME_CRASHED)
 

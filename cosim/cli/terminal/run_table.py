@@ -11,8 +11,9 @@ from rich.console import Console
 from rich.table import Column, Table
 
 from cosim.core.telling import milliseconds
+from cosim.episode.log import holds_waypoints
 from cosim.judge.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
-from cosim.records.results import not_to_be_quoted, summary_of
+from cosim.records.results import not_to_be_quoted, policy_in_words, summary_of
 from cosim.spec.scenario import Scenario, read_suite
 
 SHOWN = (
@@ -56,8 +57,8 @@ WITH_PEOPLE = (
 """Means over the episodes of a kind: shares of them, and metres."""
 
 
-def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
-    """The table of a run: a row per episode, then the means with their intervals. Made for 80 columns."""
+def print_table(out: Console, table: pd.DataFrame, scheduled: int, folder: Path | None = None) -> None:
+    """Print the table of a run: a row per episode, then the means with their intervals. folder: of the run."""
     heads = (*(f"{head}\n{UNITS.get(head, '')}" for _, head in SHOWN), "counts")
     numbers = (Column(head, no_wrap=True, justify="right") for head in heads)
     shown = Table(
@@ -73,7 +74,7 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int) -> None:
             counts,
         )
     out.print(shown)
-    print_terms(out, table)
+    print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
     out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
     print_means(out, table)
@@ -113,31 +114,29 @@ def print_statuses(out: Console, table: pd.DataFrame, scheduled: int) -> None:
         out.print(f"not to be quoted: {reason}", soft_wrap=True, highlight=False)
 
 
-def print_terms(out: Console, table: pd.DataFrame) -> None:
-    """What the policy saw by and was told of where to go, where it ran, how its waypoints were followed, the run's
-    seed; and what is not as the robot has it."""
+def print_terms(out: Console, table: pd.DataFrame, folder: Path | None = None) -> None:
+    """Print by which terms a run drove: policy, camera, goal, odometry, where the policy ran, how its waypoints were
+    followed, seed; and what is nonstandard. Without a camera, or waypoints in the run's folder, these are left out."""
     named = [
-        "camera",
-        "rate_hz",
-        "goal_protocol",
-        "odometry",
-        "privileged",
-        "waypoints",
-        "run_seed",
-        "nonstandard",
-        "policy_runs",
-    ]
+        "policy", "camera", "rate_hz", "goal_protocol", "odometry", "privileged", "waypoints", "run_seed",
+        "nonstandard", "policy_runs",
+    ]  # fmt: skip
     if not {*named} <= set(table.columns):
         return
-    for camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
+    follows = folder is None or any(map(holds_waypoints, folder.glob("episodes/*/trajectory.npz")))
+    for policy, camera, rate_hz, goal, odometry, knows, waypoints, seed, odd, runs in (
         table[named].drop_duplicates().itertuples(index=False)
     ):
-        told = (
-            f"goal {goal}; odometry {odometry}; "
-            + "privileged; " * bool(knows)
-            + f"policy {runs}; " * (runs != "in-process")
-        )
-        out.print(f"camera {camera}, at {rate_hz:g} Hz; {told}{waypoints}; seed {seed}", highlight=False, markup=False)
+        told = [
+            f"policy {policy_in_words(policy, knows)}",
+            f"at {rate_hz:g} Hz" if camera == "none" else f"camera {camera}, at {rate_hz:g} Hz",
+            f"goal {goal}",
+            f"odometry {odometry}",
+            *([f"policy {runs}"] if runs != "in-process" else []),
+            *([waypoints] if follows else []),
+            f"seed {seed}",
+        ]
+        out.print("; ".join(told), highlight=False, markup=False)
         if odd:
             out.print(f"* nonstandard, not to be compared: {odd}", highlight=False, markup=False)
     if words := _latency_in_words(table):

@@ -12,7 +12,9 @@ import msgspec
 import numpy as np
 
 from cosim.core.telling import duration, milliseconds
+from cosim.episode.log import holds_waypoints
 from cosim.records.figures import median_answer_ms
+from cosim.records.results import policy_in_words
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
 from cosim.report.page.reasons import CAUSES, mishaps_of
 from cosim.report.page.runs import ReportedRun, place_in_words
@@ -216,8 +218,10 @@ def _facts(run: ReportedRun) -> dict[str, str]:
     walls = [record.clock["wall_s"] for record in run.records if "wall_s" in record.clock]
     wall = f"{duration(sum(walls))} in all, {np.median(walls):.1f} s the median episode" if walls else "not told"
     took_ms = median_answer_ms(run.records)
+    follows = any(map(holds_waypoints, run.path.glob("episodes/*/trajectory.npz")))
+    called = policy_in_words(spec.policy_name, run.records[0].privileged)
     return {
-        "policy": f"{spec.policy_name} {spec.policy_version} ({spec.policy})",
+        "policy": f"{called} {spec.policy_version} ({spec.policy})",
         "its source": spec.policy_source or "not told",
         "suite": f"{spec.suite} {spec.suite_version}, {spec.suite_hash}",
         "scenarios": f"{len(spec.scenarios)} scheduled, {len(run.records)} ended",
@@ -229,7 +233,7 @@ def _facts(run: ReportedRun) -> dict[str, str]:
         "an answer took": "not told" if took_ms is None else f"{milliseconds(took_ms)}, the median",
         "latency": "of each answer, measured" if spec.real_time else f"{spec.latency_ms:g} ms",
         "privileged": "yes: knows what no robot can" if run.records[0].privileged else "no",
-        "waypoints": spec.waypoints.in_words,
+        "waypoints": spec.waypoints.in_words if follows else "none: it answers with commands",
         "robot": ", ".join(f"{name} ({digest})" for name, digest in spec.robots.items()),
         "seed of the run": str(spec.seed),
         "wall time": wall,

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cosim.records.results import not_to_be_quoted, summary_of
+from cosim.records.results import ORACLE, not_to_be_quoted, summary_of
 from cosim.report.page.paper import EVENT_COLUMNS, LONG_OF_PAPER, REACTIVE_OF_PAPER, UNIT_OF_PAPER, Row
 from cosim.report.page.runs import OF_THE_PAPER, PaperTable, ReportedRun
 
@@ -222,7 +222,8 @@ def _marks(table: pd.DataFrame) -> str:
     """What a reader must know of a row: how many episodes, and who knew more than a robot can."""
     notes = [f"{len(table)} episode{'s' * (len(table) != 1)}"]
     notes += ["crowd added"] * bool(table["crowd_added"].any())
-    notes += ["privileged"] * bool(table["privileged"].any())
+    if table["privileged"].any():
+        notes.append("oracle, privileged" if ORACLE in {*table["policy"]} else "privileged")
     notes += ["nonstandard camera"] * bool((table["nonstandard"] != "").any())
     return f"<small>{', '.join(notes)}</small>"
 

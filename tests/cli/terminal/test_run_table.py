@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pandas as pd
 import pytest
 from rich.console import Console
 
 from cosim.cli.results.show import print_sheet
-from cosim.cli.suites.catalog import print_scenarios
+from cosim.cli.suites.catalog import print_names, print_scenarios
+from cosim.cli.terminal.next_commands import print_next_commands
 from cosim.cli.terminal.run_table import (
     COUNTS,
     LETTERS,
@@ -20,13 +23,16 @@ from cosim.cli.terminal.run_table import (
     WITH_PEOPLE,
     print_by_kind,
     print_table,
+    print_terms,
 )
 from cosim.core.errors import unknown
 from cosim.judge.metrics import METRICS, SUCCESS_IN_WORDS
+from cosim.records.results import table_of
 from cosim.spec.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, load_suite
 from scenarios.events.table import EVENT_KINDS
 from scenarios.viewing.eventsheet import COLUMNS
+from tests.records.driven_runs import episode_of, short_way
 
 
 def terminal() -> tuple[Console, io.StringIO]:
@@ -178,6 +184,7 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
     }
     row |= {"goal_protocol": "route_point", "odometry": "gps", "privileged": True}  # type: ignore[dict-item]
     row |= {
+        "policy": "orca",
         "rate_hz": 4.0,
         "waypoints": "waypoint 2, units of 1 m, in 0.25 s, shipped",
         "run_seed": 7,
@@ -189,7 +196,49 @@ def test_a_table_tells_what_the_policy_saw_by_and_marks_what_is_nonstandard() ->
         print_table(out, pd.DataFrame([row | {"nonstandard": odd}]), 1)
         text = " ".join(said.getvalue().split())
         assert (
-            "camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; odometry gps; privileged; waypoint 2, "
-            "units of 1 m, in 0.25 s, shipped; seed 7" in text
+            "policy orca (oracle, privileged); camera own mount, 64 x 64 px, 75 deg, at 4 Hz; goal route_point; "
+            "odometry gps; waypoint 2, units of 1 m, in 0.25 s, shipped; seed 7" in text
         )
         assert ("s-1*" in text) is ("* nonstandard, not to be compared: a camera of its own" in text) is star
+
+
+def test_a_table_leaves_out_the_camera_and_the_waypoints_that_a_policy_does_not_have(tmp_path: Path) -> None:
+    """A blind policy has no camera in its line; waypoints stand there where an answer in the run's folder was some."""
+    record, log = episode_of(short_way("s-0"), "h")
+    assert log is not None
+    plan = {"plan_sizes": np.ones(1, np.int32), "plan_points": np.ones((1, 2), np.float32), "plan_index": 0}
+    for name, one in (("commands", log), ("waypoints", dataclasses.replace(log, answers=np.ones((1, 4)), **plan))):
+        (tmp_path / name / "episodes/s-0").mkdir(parents=True)
+        (tmp_path / name / "episodes/s-0/trajectory.npz").write_bytes(one.encoded())
+        out, said = terminal()
+        print_terms(out, table_of([record]), tmp_path / name)
+        text = " ".join(said.getvalue().split())
+        assert text.startswith("policy p; at 4 Hz; goal none; odometry none; ") and "camera" not in text
+        assert ("waypoint 2, units of 1 m" in text) is (name == "waypoints")
+
+
+def test_the_list_says_which_policies_know_more_than_a_robot() -> None:
+    """`orca` is the oracle; it and two other baselines are privileged, those that see are not."""
+    out, said = terminal()
+    print_names(out)
+    named = [line.split("  ")[1] for line in said.getvalue().splitlines() if line.startswith("policy ")]
+    privileged = ["route (privileged)", "orca (oracle, privileged)", "social_force (privileged)"]
+    assert named[:5] == ["stop", "straight", *privileged] and "small" in named
+    assert not any("privileged" in name for name in named[5:])
+
+
+def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
+    """A film of the failure, or of an episode where none failed, a report, one episode; without a track a report."""
+
+    def told(*rows: tuple[str, str | None, float]) -> list[str]:
+        said = io.StringIO()
+        table = pd.DataFrame(rows, columns=["scenario", "ended", "success"])
+        print_next_commands(Console(file=said, width=40), Path("runs/my run"), table)
+        return [line.strip() for line in said.getvalue().splitlines()]
+
+    report = "cosim report 'runs/my run' -o report.html"
+    assert told(("a", "goal", 1.0), ("b", "failure", 0.0)) == [
+        "Next:", "cosim film 'runs/my run' --failure -o film.mp4", report, "cosim show 'runs/my run' --episode b"
+    ]  # fmt: skip
+    assert told(("a", "goal", 1.0))[1] == "cosim film 'runs/my run' a -o film.mp4"
+    assert told(("a", None, 0.0)) == ["Next:", report]
