@@ -177,13 +177,15 @@ def span(found: Estimate) -> str:
 
 
 @contextmanager
-def remembered(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> Iterator[None]:
-    """What of `todo` is finished in the block is remembered at its end, however it ends."""
+def remembered(held: RunFolder, todo: Sequence[Scenario], jobs: int, pace: float = 0.0) -> Iterator[None]:
+    """What of `todo` is finished in the block is remembered at its end, however it ends. Episodes that are held to a
+    `pace` are not: they do not show how fast this machine is."""
     try:
         yield
     finally:
-        with suppress(OSError, CosimError, KeyError):
-            remember(held, todo, jobs)
+        if not pace:
+            with suppress(OSError, CosimError, KeyError):
+                remember(held, todo, jobs)
 
 
 def remember(held: RunFolder, todo: Sequence[Scenario], jobs: int) -> None:

@@ -149,6 +149,15 @@ def test_a_run_is_remembered_even_when_it_is_stopped(tmp_path: Path, cache: Path
     assert "measured in 3 episodes of 'route' on this machine" in announcement(LONG, "route", GL, 1, False)
 
 
+def test_a_run_that_is_held_to_real_time_is_not_remembered(tmp_path: Path, cache: Path) -> None:
+    """It took as long as it was to take, and the next estimate does not rest on that."""
+    with run_of(tmp_path / "run") as held:
+        finished(held, LONG[0], "done")
+        with remembered(held, LONG, 1, 1.0):
+            pass
+    assert recall() == []
+
+
 def test_what_is_remembered_stays_small_and_survives_damage(tmp_path: Path, cache: Path) -> None:
     """Lines of other machines and of nonsense are passed over, old ones go; a cache that cannot be written is none."""
     cache.mkdir()

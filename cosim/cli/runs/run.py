@@ -208,8 +208,8 @@ def carry_out(
         try:
             with ExitStack() as running:
                 running.callback(go.end)
-                if carrier is None and not pace:  # what is held back says nothing of this machine
-                    running.enter_context(remembered(run.held, run.todo, jobs))
+                if carrier is None:
+                    running.enter_context(remembered(run.held, run.todo, jobs, pace))
                 running.enter_context(board.bars)
                 run_what_is_left(plan, run, reaches, board.tell)
         except KeyboardInterrupt:
