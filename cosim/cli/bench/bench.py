@@ -16,6 +16,7 @@ from cosim.cli.bench.people import bench_people
 from cosim.cli.options.panels import MEASURE
 from cosim.cli.options.street import CHILDREN_HELP, ELDERLY_HELP, GROUPS_HELP
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import UsageError, unknown
 
@@ -112,7 +113,7 @@ def _compare(other: Path, what: str, only: Sequence[str], rounds: int) -> None:
         mine, theirs = ([one.value for one in found[name]] for found in (here, there))
         ratios = [a / b for a, b in zip(mine, theirs, strict=True)]
         table.add_row(name, spread(mine)[0], spread(theirs)[0], *spread(ratios))
-    out.print(table)
+    print_fitted(out, table)
     out.print(f"medians; a ratio a round, {rounds} in all, the checkouts in turns", highlight=False)
 
 
@@ -133,7 +134,7 @@ def print_figures(found: Mapping[str, Sequence[Figure]]) -> None:
         if first.reach is not None:
             reach = f"{'ratio' if first.reach_ratio else ''} {first.better} {first.reach:,.4g}".strip()
         table.add_row(escape(name + mark), *spread([one.value for one in rounds]), limit, ratio, reach)
-    out.print(table)
+    print_fitted(out, table)
     for i, words in enumerate(limits):
         out.print(f"limit [{i + 1}]: {words}", markup=False, highlight=False)
 
@@ -157,12 +158,12 @@ def bench_cameras(rounds: int) -> None:
     for figure in FIGURES:
         least, fps = figure.least_fps[on_gpu], found[figure.name].fps
         table.add_row(figure.name, *(spread(fps) if fps else NONE), "" if least is None else f">= {least:,.4g}")
-    out.print(table)
+    print_fitted(out, table)
     ratios = Table("ratio", "median", "spread", "target")
     for name, above, below, target in RATIOS:
         values = [a / b for a, b in zip(found[above].fps, found[below].fps, strict=False)]
         ratios.add_row(name, *(spread(values) if values else NONE), target)
-    out.print(ratios)
+    print_fitted(out, ratios)
     out.print(f"{drawn_by}; {rounds} {'round' if rounds == 1 else 'rounds'}, medians", highlight=False)
     wrong: dict[str, list[str]] = {}
     for name, one in found.items():

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from rich.table import Table
 
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 
 LIGHTS = (
@@ -49,7 +50,7 @@ def bench_crowd(cities: int, minutes: float, residents: int, groups: float, elde
     told = {name for name, whole, _ in SHARES for name in (name, whole)}
     for name in sorted(counts.keys() - told):
         table.add_row(name, f"{counts[name]:.2f}", "", "", "")
-    out.print(table)
+    print_fitted(out, table)
     out.print("People and pairs are counted in seconds, entries and vehicles one by one.")
     each = Table("city", "min", "persons", "overlaps, share of pair-seconds", "crowd's step, CPU ms")
     for one in found:
@@ -57,7 +58,7 @@ def bench_crowd(cities: int, minutes: float, residents: int, groups: float, elde
         each.add_row(
             one.place, f"{one.minutes:.0f}", f"{one.persons:.0f}", f"{100 * overlaps:.4f} %", f"{one.crowd_ms:.2f}"
         )
-    out.print(each)
+    print_fitted(out, each)
     if gaps_m := sorted(gap for one in found for gap in one.group_gaps_m):
         middle, most = (gaps_m[int(share * len(gaps_m))] for share in (0.5, 0.95))
         apart = sum(gap > APART_M for gap in gaps_m) / len(gaps_m)
@@ -89,13 +90,13 @@ def bench_crossings(crossings: int, cities: int, policy: str, jobs: int) -> None
     mean = f"{sum(waited) / len(waited):.1f} s each on the mean" if waited else ""
     robot.add_row("waited at red", str(len(waited)), mean)
     robot.add_row("on the carriageway, or on a crossing at red", f"{sum(r.carriageway_s for r in rows):.1f} s", "")
-    out.print(robot)
+    print_fitted(out, robot, words=[2])
     counts = summed(row.counts for row in rows)
     lights = Table(f"crowd and vehicles, {crossings_entered(rows)} crossings entered", "count", "of", "share", "target")
     _add_shares(lights, LIGHTS, counts)
     for name in ("vehicles drove over a crossing at walk", "vehicles within 1 m of a walker on it"):
         lights.add_row(name, f"{counts.get(name, 0.0):.2f}", "", "", "")
-    out.print(lights)
+    print_fitted(out, lights)
     for row in rows:
         for who in row.at_red:
             out.print(f"{row.scenario}: {who}", soft_wrap=True, markup=False, highlight=False)

@@ -9,6 +9,7 @@ from rich import box
 from rich.table import Column, Table
 
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 
 if TYPE_CHECKING:
@@ -36,7 +37,7 @@ def bench_people(jobs: int) -> None:
     with doing("watching people") as tell:
         found = watch_people(jobs, lambda words: tell(f"watching people: {words}"))
     for table in (_by_density(found), _free(found), _nearest(found), _gaps(found)):
-        out.print(table)
+        print_fitted(out, table)
     for note in _NOTES:
         out.print(note, highlight=False)
 

@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.core.errors import AccessError, unknown
 from cosim.spec.connection import Role
 
@@ -74,7 +75,7 @@ def show_certificates(
         who = identity_in(path)
         may = RIGHTS[who.role].words
         table.add_row(path.name, who.role, ", ".join(who.hosts), may, time_left(who))
-    out.print(table)
+    print_fitted(out, table, words=[2, 3])
 
 
 def _print_made(place: Path) -> None:

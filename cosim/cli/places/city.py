@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich import box
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Column, Table
 
 from cosim.cli.options.output_file import replaced
 from cosim.cli.terminal.consoles import err, out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import SOME_CRASHED
@@ -144,14 +144,13 @@ def print_cities(found: Sequence[Survey]) -> None:
             for x in [pick([value(one) for one in found])]
         ]
         shown.add_row(name, *cells)
-    wide = Console(width=max(out.width, 140))
-    wide.print(shown)
+    print_fitted(out, shown)
     zones = Table("zone", "narrowest m", "median m", "widest m", box=box.SIMPLE_HEAD)
     for zone in found[0].census.zones:
         spans = [one.census.zones[zone] for one in found]
         middle = statistics.median(span.middle for span in spans)
         zones.add_row(zone, f"{min(s.low for s in spans):.2f}", f"{middle:.2f}", f"{max(s.high for s in spans):.2f}")
-    out.print(zones)
+    print_fitted(out, zones)
     out.print(MEANING)
     faulty = [(one.seed, fault) for one in found for fault in one.faults]
     for seed, fault in faulty:

@@ -14,6 +14,7 @@ from rich.table import Table
 
 from cosim.cli.options.output_file import replaced
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
@@ -122,7 +123,7 @@ def endure_map(
         simulated_min = Clock().time_s(done.ticks) / 60.0
         cells = (f"{simulated_min:.1f}", f"{done.persons:.0f}", f"{done.vehicles:.0f}", f"{done.wall_s:.0f}")
         table.add_row(name, *cells, escape(done.reason or "its time"))
-    out.print(table)
+    print_fitted(out, table, words=[5])
     if failed:
         raise typer.Exit(SOME_CRASHED)
 
@@ -135,7 +136,7 @@ def list_() -> None:
     table = Table("map", "origin", "file", box=box.SIMPLE_HEAD)
     for known in known_maps().values():
         table.add_row(known.name, known.origin, known.source)
-    out.print(table)
+    print_fitted(out, table, words=[1, 2])
 
 
 def print_check(check: MapCheck, about: About | None) -> None:
@@ -145,7 +146,7 @@ def print_check(check: MapCheck, about: About | None) -> None:
     for what, value in _rows(check):
         table.add_row(what, value)
     table.add_row("size", f"{width_m:.0f} x {height_m:.0f} m, traffic on the {'left' if check.left_hand else 'right'}")
-    out.print(table)
+    print_fitted(out, table, words=[1])
     said = [("note", note) for note in check.notes]
     if about is not None:
         said += [("changed", change) for change in about.changes]

@@ -15,6 +15,7 @@ from cosim.cli.options.camera import CAMERA_HELP, Choice, camera_here
 from cosim.cli.options.endpoint import Insecure, Tls, ends_of_run
 from cosim.cli.options.output_file import check_output, replaced
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import SOME_CRASHED, unknown
 
@@ -116,4 +117,4 @@ def _print(found: CheckedPolicy) -> None:
     table = Table("check", "", "what was seen", box=box.SIMPLE_HEAD)
     for name, (outcome, words) in found.outcomes.items():
         table.add_row(name, f"[{_COLOURS[outcome]}]{outcome}[/]", escape(words))
-    out.print(table)
+    print_fitted(out, table, words=[2])

@@ -14,6 +14,7 @@ from rich.text import Text
 from cosim.cli.options.output_file import replaced
 from cosim.cli.options.panels import TRUST
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import UsageError, unwritable
 
@@ -75,7 +76,7 @@ def print_comparison(out: Console, told: RunComparison) -> None:
             )
             for row in table.rows:
                 shown.add_row(*map(Text, row))
-            out.print(shown)
+            print_fitted(out, shown, table.names)
         for line in flips_in_words(told, other):
             out.print(line, soft_wrap=not out.is_terminal, markup=False, highlight=False)
     for note in (*told.notes, how_to_read(told)):

@@ -13,6 +13,7 @@ from rich.table import Column, Table
 from cosim.cli.options.output_file import replaced
 from cosim.cli.options.recording import RERUN_HELP, write_rerun
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import UsageError, unknown
 from cosim.core.telling import milliseconds
@@ -109,7 +110,7 @@ def print_episode(out: Console, record: Record) -> None:
     for name, unit in COUNTERFACTUAL.items():
         if name in record.measures:
             table.add_row(name, value_in_words(record.measures[name]), unit)
-    out.print(table)
+    print_fitted(out, table)
 
 
 def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
@@ -124,13 +125,13 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
         name = row[0] if row[0].startswith(row[1]) else f"{row[0]} {row[1]}"
         numbers = (f"{value:.{digits}f}" for value, digits in zip(row[2:], (2, 3, 3, 2, 2, 2, 0, 2), strict=True))
         rows.add_row(name, *("-" if n == "nan" else n for n in numbers))
-    out.print(rows)
+    print_fitted(out, rows)
     for short in summary(sheet):
         columns = (Column(head, no_wrap=True) for head in short.columns)
         table = Table(*columns, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
         for row in short.itertuples(index=False):
             table.add_row(*(str(value) for value in row))
-        out.print(table)
+        print_fitted(out, table)
     out.print(
         "trigger: from the robot to the event's place, when it began; error: off what is stated; tick: what the robot "
         "drove in a tick, the most that the error may be; off: triggers beyond that; speed: of the person while it "

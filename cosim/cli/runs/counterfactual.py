@@ -10,6 +10,7 @@ from rich.table import Table
 
 from cosim.cli.options.panels import LOOK
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 
 counterfactual_app = typer.Typer()
@@ -34,7 +35,7 @@ def compare_one(
     for name, delay in (("people", found.people), ("vehicles", found.vehicles)):
         near, everybody = (f"{delay.near_s:+.1f}", str(delay.near)), (f"{delay.delay_s:+.1f}", str(delay.compared))
         table.add_row(name, *near, *everybody, str(delay.unmatched))
-    out.print(table)
+    print_fitted(out, table)
     out.print(
         f"delay: how much later than without the robot, summed; near: came within {DELAY_NEAR_M:g} m of it; far from "
         "it the two streets differ by chance; not comparable: not the same in both"

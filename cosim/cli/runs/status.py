@@ -16,6 +16,7 @@ from rich.text import Text
 from cosim.cli.options.endpoint import Insecure, Tls, connecting, warned
 from cosim.cli.options.panels import MANY
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import parts_of_table
 from cosim.core.errors import INTERRUPTED, EngineError, RunError, UsageError
 from cosim.core.telling import duration
 
@@ -128,7 +129,7 @@ def _picture(told: RunStatus, remark: str) -> Group:
             silent = duration(one.silent_s) if one.silent_s > 0.5 else "now"
             told_of = "\n".join(_under(under) for under in one.under_way) or one.why
             table.add_row(one.name, Text(one.state, style=_COLOURS[one.state]), silent, str(one.done), told_of)
-        parts.append(table)
+        parts += parts_of_table(out, table, words=[4])
     elif told.finished < told.total and not remark:
         parts.append(Text("No worker is there: start some with `cosim worker`."))
     parts += [Text(line, style="bold red") for line in told.conflicts]

@@ -11,6 +11,7 @@ from rich.markup import escape
 from rich.table import Column, Table
 
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 
 if TYPE_CHECKING:
     from cosim.spec.scenario import Suite
@@ -69,4 +70,4 @@ def print_scenarios(out: Console, suite: Suite) -> None:
         events = s.events[0].kind if len(s.events) == 1 else str(len(s.events))
         numbers = (f"{s.route_line.length_m:.0f}", str(len(s.crossings)), events, str(len(s.barriers)))
         shown.add_row(s.id, escape(s.place.name), *numbers, f"{s.time_limit_s:.0f}")
-    out.print(shown)
+    print_fitted(out, shown)

@@ -19,6 +19,7 @@ from cosim.cli.options.output_file import replaced
 from cosim.cli.options.recording import RERUN_HELP, check_rerun, write_rerun
 from cosim.cli.terminal.board import Board
 from cosim.cli.terminal.consoles import err, out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.box import box_of, refuse_outside
 from cosim.core.errors import (
@@ -286,7 +287,7 @@ def _print_sweep(summary: pd.DataFrame, fields: list[str]) -> None:
         ]
         scored = f"{means['n'].max():.0f}"
         shown.add_row(*(f"{value}" for value in values), scored, *cells)
-    out.print(shown)
+    print_fitted(out, shown, len(fields))
     out.print(
         f"n episodes that are scored; SR {SUCCESS_IN_WORDS}; SPL the same by path length; "
         "RC share of the route done; FC all failures on all metres, per 100 m; below: 95 % intervals"
@@ -316,7 +317,7 @@ def _print_scenarios(suite: Suite, own: OwnFile) -> None:
         counts = (str(len(there)) for there in (one.crossings, one.events, one.obstacles))
         length = f"{one.route_line.length_m:.1f}"
         shown.add_row(one.id.removeprefix(short), content_hash(one), length, *counts, people)
-    out.print(shown)
+    print_fitted(out, shown)
     pairs = zip(own.variants, suite.scenarios, strict=True)
     for name, far_m in dict.fromkeys(end for variant, one in pairs for end in moved_m(variant.own.way, one)):
         if far_m > _MOVED_M:

@@ -10,6 +10,7 @@ from rich import box
 from rich.table import Table
 
 from cosim.cli.terminal.consoles import err, out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.cli.terminal.progress import doing
 from cosim.core.errors import SOME_CRASHED, SpecError, unknown
 
@@ -108,7 +109,7 @@ def _checked(name: str, sample: int | None, drive: int | None, jobs: int) -> int
     for claim, count in looked.items():
         found = faults.get(claim, [])
         table.add_row(claim, str(count), str(len(found)) if found else "-")
-    out.print(table)
+    print_fitted(out, table)
     for claim, words in ((claim, words) for claim, found in faults.items() for words in found):
         out.print(f"{suite.name}, {claim}: {words}", soft_wrap=True, markup=False, highlight=False)
     return sum(bool(found) for found in faults.values())
@@ -126,4 +127,4 @@ def list_suites() -> None:
         test = sum(scenario.split == "test" for scenario in suite.scenarios)
         counts = (str(len(suite.scenarios)), str(len(suite.scenarios) - test), str(test))
         table.add_row(name, *counts, suite.version, suite.content_hash, RECIPES[name].purpose)
-    out.print(table)
+    print_fitted(out, table, words=[6])

@@ -10,6 +10,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Column, Table
 
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.core.telling import milliseconds
 from cosim.episode.log import holds_waypoints
 from cosim.judge.metrics import COUNTERFACTUAL, SUCCESS_IN_WORDS
@@ -73,7 +74,7 @@ def print_table(out: Console, table: pd.DataFrame, scheduled: int, folder: Path 
             *(value_in_words(row[name]) for name, _ in SHOWN),
             counts,
         )
-    out.print(shown)
+    print_fitted(out, shown)
     print_terms(out, table, folder)
     counted = "/".join(name for _, name in COUNTS)
     out.print("; ".join(f"{letter} {meaning}" for letter, meaning in LETTERS.items()) + f"; counts: {counted}")
@@ -89,7 +90,7 @@ def print_means(out: Console, table: pd.DataFrame) -> None:
     means = Table("over all episodes", "", "95 % interval", "n", box=box.SIMPLE_HEAD)
     for (name, head), (_, row) in zip(MEANS, summary_of(table, [n for n, _ in MEANS]).iterrows(), strict=True):
         means.add_row(f"{name} ({head})" if head else name, *_mean_cells(row))
-    out.print(means)
+    print_fitted(out, means)
     crashed = int((table["status"] == "crashed").sum())
     missing = f"; none, because {crashed} crashed" if crashed else ""
     out.print(f"rates are pooled: all failures on all metres{missing}; what crashed counts as the worst elsewhere")
@@ -171,7 +172,7 @@ def print_delays(out: Console, table: pd.DataFrame) -> None:
     shown = Table("against the same street without the robot", "per episode", "95 % interval", "n", box=box.SIMPLE_HEAD)
     for name, row in summary_of(table, tuple(COUNTERFACTUAL)).iterrows():
         shown.add_row(str(name), *_mean_cells(row))
-    out.print(shown)
+    print_fitted(out, shown)
 
 
 def value_in_words(value: float | None) -> str:
@@ -208,7 +209,7 @@ def print_by_kind(out: Console, table: pd.DataFrame, kinds: Mapping[str, str]) -
         success, *rest = (value_in_words(mean) for mean in means["mean"])
         invalid = str((part["status"] == "invalid").sum())
         shown.add_row(kind, f"{scored:.0f}", success, interval, *rest, invalid)
-    out.print(shown)
+    print_fitted(out, shown)
     out.print(
         "n episodes that are scored; hit a person, hit else, left lane, broke rule: share of these; nearest: least "
         "distance to a person's centre, mean over episodes, of wins: over those that succeeded; SPL success by path "
@@ -232,4 +233,4 @@ def print_by_split(out: Console, table: pd.DataFrame) -> None:
             for _, row in means.iterrows()
         )
         shown.add_row(str(split), f"{means['n'].iloc[0]:.0f}", *cells)
-    out.print(shown)
+    print_fitted(out, shown)

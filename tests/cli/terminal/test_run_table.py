@@ -35,9 +35,9 @@ from scenarios.viewing.eventsheet import COLUMNS
 from tests.records.driven_runs import episode_of, short_way
 
 
-def terminal() -> tuple[Console, io.StringIO]:
+def terminal(width: int = 80) -> tuple[Console, io.StringIO]:
     said = io.StringIO()
-    return Console(file=said, width=80), said
+    return Console(file=said, width=width), said
 
 
 @pytest.mark.parametrize("name", SUITES)
