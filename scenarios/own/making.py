@@ -107,10 +107,7 @@ def place_of_own(own: OwnPlace) -> Place:
             return CityMap(map=imported_place(path), roughness=own.roughness)
         return place_called(own.file, own.roughness)
     except MapError as error:
-        remedy = (
-            ": `cosim map import` takes that, and gives the name for place.map" if "--upgrade" in str(error) else ""
-        )
-        raise MapError(f"place.file: {error}{remedy}") from error
+        raise MapError(f"place.file: {error}") from error
 
 
 @lru_cache(maxsize=1024)

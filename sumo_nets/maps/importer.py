@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import subprocess
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
@@ -23,9 +24,9 @@ from cosim.place.street_map import Feature
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.featurefit import fitted
+from sumo_nets.maps.importrules import NEWEST, Rules
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
-from sumo_nets.maps.signalcheck import mend_signals
 from sumo_nets.net.netconvert import complaints, netconvert
 from sumo_nets.net.netfacts import allows, facts_of, footway, net_root, read_facts
 from sumo_nets.net.netfile import read_net
@@ -66,13 +67,18 @@ OSM_LICENCE = (
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """What the user asked for. bbox: west, south, east, north in degrees, or x0, y0, x1, y1 of a net without a
-    projection. lefthand: None to look it up.
+    """Options of an import.
+
+    bbox: west, south, east, north in degrees, or x0, y0, x1, y1 of a net without a projection.
+    lefthand: None to look it up.
+    as_is: leave a SUMO net unchanged, even one without sidewalks.
+    rules: the version of the importer.
     """
 
     bbox: _Box | None = None
     lefthand: bool | None = None
-    upgrade: bool = False
+    as_is: bool = False
+    rules: Rules = NEWEST
 
     def __post_init__(self) -> None:
         if self.bbox is not None:
@@ -111,8 +117,10 @@ def convert(source: Path, folder: Path, options: Options) -> Converted:
 
 def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str]) -> Converted:
     found = osm_facts(file)
-    if options.upgrade:
-        changes.append("--upgrade has no effect: walkways are guessed for every OpenStreetMap file")
+    if options.as_is:
+        raise UsageError(
+            f"{file.source}: --as-is is for SUMO nets; an OpenStreetMap file is always converted: leave --as-is out"
+        )
     extra = ["--lefthand"] if _left_hand(found, options, changes) else []
     types = ",".join(str(_sumo_home() / "data" / "typemap" / name) for name in TYPES)
     net = _netconvert(
@@ -128,38 +136,55 @@ def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str])
     if share:
         changes.append(f"guessed {share:.0%} of the pavement's length: the file does not speak of it")
     licences = [OSM_LICENCE, found.licence] if found.licence else [OSM_LICENCE]
-    return _finish(file, net, root, changes, share, licences)
+    return _finish(file, net, options.rules, changes, share, licences)
 
 
 def _from_net(file: MapFile, folder: Path, options: Options, changes: list[str]) -> Converted:
     facts = read_facts(file.path) if options.lefthand is None else _sided(read_facts(file.path), options, file)
+    if not facts.edges:
+        raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
     net = file.path
     before = {edge.get("id") for edge in net_root(net).iter("edge") if _pavement(edge) is not None}
     net = _crop(file, folder, net, options.bbox, changes)
+    if options.as_is:
+        return _unchanged(file, net, facts, changes)
     share: float | None = None
-    if options.upgrade and facts.areas and facts.pavement_km + facts.shared_km > 0.0:
-        changes.append("--upgrade has no effect: the net has sidewalks and walking areas of its own")
-    elif options.upgrade:
+    if _lacks_walkways(facts):
         net = _upgraded(file, folder, net, facts, changes)
         share = _new_share(net_root(net), before)
-    elif not facts.areas or facts.pavement_km + facts.shared_km == 0.0:
-        km = facts.pavement_km + facts.shared_km
-        raise MapError(
-            f"{file.source}: a net of {facts.edges} edges with {km:.1f} km of sidewalks and {facts.areas} walking "
-            "areas: nobody can walk from street to street; give it walkways with --upgrade"
-        )
     elif _old(facts.version):
         net = _netconvert(folder, "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
-    return _finish(file, net, net_root(net), changes, share, [])
+    return _finish(file, net, options.rules, changes, share, [])
+
+
+def _lacks_walkways(facts: NetFacts) -> bool:
+    return not facts.areas or facts.pavement_km + facts.shared_km == 0.0
+
+
+def _unchanged(file: MapFile, net: Path, facts: NetFacts, changes: list[str]) -> Converted:
+    """The net as it is, with what is not possible on it. Raises MapError when SUMO does not start on it."""
+    final = net.with_name("final.net.xml")
+    shutil.copyfile(net, final)
+    _start_sumo(file, final)
+    if _lacks_walkways(facts):
+        km = facts.pavement_km + facts.shared_km
+        changes.append(
+            f"left as it is (--as-is), with {km:.1f} km of sidewalks and {facts.areas} walking areas: no crowd, no "
+            "route and no scenario is possible on it; import it without --as-is to add sidewalks and crossings"
+        )
+    else:
+        changes.append("left as it is (--as-is): signals and corners are not mended")
+    return Converted(final, facts, (), file.format, file.packing, tuple(changes), None, ())
 
 
 def _finish(
-    file: MapFile, net: Path, root: ET.Element, changes: list[str], share: float | None, licences: list[str]
+    file: MapFile, net: Path, rules: Rules, changes: list[str], share: float | None, licences: list[str]
 ) -> Converted:
     """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on it."""
-    final = net.with_name("final.net.xml")
-    changes += mend_signals(root)
+    final, root = net.with_name("final.net.xml"), net_root(net)
+    for mend in rules.mends:
+        changes += mend(root)
     ET.ElementTree(root).write(final, encoding="UTF-8", xml_declaration=True)
     facts = facts_of(root)
     street_map = read_net(final)
@@ -170,10 +195,10 @@ def _finish(
     if not any(strip.kind == "sidewalk" for strip in street_map.strips.values()):
         raise MapError(
             f"{file.source}: nothing walkable in it: {facts.edges} edges, none with a sidewalk or path; import an area "
-            "with streets in it, or a net of streets with --upgrade"
+            "with streets in it"
         )
     if not street_map.corners:
-        raise MapError(f"{file.source}: its sidewalks are not connected (no walking areas): try --upgrade")
+        raise MapError(f"{file.source}: its sidewalks are not connected: it has no walking areas; import a larger area")
     if facts.twisted_areas:
         changes.append(f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: repaired when read")
     _start_sumo(file, final)

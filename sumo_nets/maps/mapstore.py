@@ -20,6 +20,7 @@ from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
+from sumo_nets.maps.importrules import NEWEST, SHIPPED
 from sumo_nets.maps.rawfile import head_of
 from sumo_nets.maps.scratch import move_in, moving, scratch_in
 from sumo_nets.maps.wheel_places import WHEEL_PLACES
@@ -28,8 +29,6 @@ from sumo_nets.net.netfacts import read_facts
 from sumo_nets.net.snapshot import street_map_of
 
 ABOUT = "about.json"
-IMPORTER = 3
-"""Version of the importer: another one for every change that changes an imported net."""
 GENERIC = ("input", "map", "net", "network", "osm", "converted", "export", "planet", "osm_bbox")
 """File names that name no place: the folder's name is taken instead."""
 NAMES = re.compile(r"[a-z0-9][a-z0-9._-]{0,63}")
@@ -37,7 +36,11 @@ GAME_LICENCE = "EPL-2.0 OR GPL-2.0-or-later, with Eclipse SUMO"
 
 
 class About(msgspec.Struct, frozen=True, kw_only=True):
-    """Where an imported map comes from and what was done to it. source_hash: SHA-256 of the file, 16 hex digits."""
+    """Where an imported map comes from and what was done to it.
+
+    source_hash: SHA-256 of the file, 16 hex digits.
+    versions: of the importer (`importrules.py`) and of SUMO.
+    """
 
     name: str
     source: str
@@ -46,7 +49,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     imported_at: str
     bbox: tuple[float, float, float, float] | None
     lefthand: bool | None
-    upgrade: bool
+    as_is: bool = False
     versions: dict[str, str]
     changes: tuple[str, ...]
     guessed_share: float | None
@@ -75,9 +78,12 @@ def import_map(source: Path, name: str | None = None, options: Options | None = 
     name = map_name(source) if name is None else name
     if not NAMES.fullmatch(name):
         raise UsageError(f"'{name}' cannot name a map: use a-z, 0-9, '.', '_' and '-', at most 64 characters")
-    if name in _supplied() and source != _supplied()[name]:
-        raise UsageError(f"'{name}' is the name of a net that comes with SUMO: choose another with --name")
-    return _keep(source, name, Options() if options is None else options)
+    options = Options() if options is None else options
+    if name in _supplied():
+        if source != _supplied()[name] or options != Options():
+            raise UsageError(f"'{name}' is the name of a net that comes with SUMO: choose another with --name")
+        options = _options_of(name)
+    return _keep(source, name, options)
 
 
 def map_name(source: Path) -> str:
@@ -167,6 +173,11 @@ def known_maps() -> dict[str, Known]:
     return known | {name: Known(name, "sumo", path.name) for name, path in supplied.items()}
 
 
+def outdated(about: About) -> bool:
+    """Return whether importing the map again would apply rules that it was imported without."""
+    return about.name not in _supplied() and about.versions.get("importer") != str(NEWEST.version)
+
+
 def _source_of(name: str) -> str:
     try:
         return about_map(name).source
@@ -193,8 +204,8 @@ def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -
                 imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
                 bbox=options.bbox,
                 lefthand=options.lefthand,
-                upgrade=options.upgrade,
-                versions={"importer": str(IMPORTER), "eclipse-sumo": version("eclipse-sumo")},
+                as_is=options.as_is,
+                versions={"importer": str(options.rules.version), "eclipse-sumo": version("eclipse-sumo")},
                 changes=made.changes,
                 guessed_share=made.guessed_share,
                 licences=_licences(name, source, made.licences),
@@ -234,7 +245,7 @@ def _supplied() -> dict[str, Path]:
 def _options_of(name: str) -> Options:
     """How a place that comes with SUMO is imported."""
     one = WHEEL_PLACES.get(name)
-    return Options() if one is None else Options(bbox=one.box, upgrade=one.upgrade)
+    return Options(rules=SHIPPED) if one is None else Options(bbox=one.box, rules=one.rules)
 
 
 @cache

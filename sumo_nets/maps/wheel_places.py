@@ -10,18 +10,24 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+from sumo_nets.maps.importrules import SHIPPED, Rules
+
 _Box = tuple[float, float, float, float]
 
 
 class WheelPlace(NamedTuple):
-    """A crop of a net. net: path below the wheel's tools/game. box: west, south, east, north in degrees, None for all
-    of it. upgrade: it has no sidewalks of its own, or none that are connected: the importer adds them. osm: drawn from
-    OpenStreetMap data."""
+    """A crop of a net.
+
+    net: path below the wheel's tools/game.
+    box: west, south, east, north in degrees, None for all of it.
+    osm: drawn from OpenStreetMap data.
+    rules: the version of the importer, which decides the hash of the net.
+    """
 
     net: str
     box: _Box | None = None
-    upgrade: bool = False
     osm: bool = False
+    rules: Rules = SHIPPED
 
     @property
     def path(self) -> Path:
@@ -44,7 +50,7 @@ WHEEL_PLACES: Final[Mapping[str, WheelPlace]] = MappingProxyType(
         "berlin-7": WheelPlace(_BERLIN, (13.5404, 52.4304, 13.5498, 52.4365), osm=True),
         "ingolstadt-1": WheelPlace("fkk_in/ingolstadt.net.xml.gz", osm=True),
         "braunschweig-1": WheelPlace("fokr_bs_demo/fokr_bs.net.xml.gz"),
-        "braunschweig-2": WheelPlace(_BRAUNSCHWEIG, (10.5256, 52.2699, 10.5350, 52.2762), upgrade=True, osm=True),
-        "wildau-1": WheelPlace(_WILDAU, (13.5939, 52.3129, 13.6059, 52.3202), upgrade=True, osm=True),
+        "braunschweig-2": WheelPlace(_BRAUNSCHWEIG, (10.5256, 52.2699, 10.5350, 52.2762), osm=True),
+        "wildau-1": WheelPlace(_WILDAU, (13.5939, 52.3129, 13.6059, 52.3202), osm=True),
     }
 )  # fmt: skip

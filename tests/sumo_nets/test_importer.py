@@ -19,18 +19,21 @@ from cosim.core.errors import MapError, UsageError
 from cosim.place.route_line import through_corner
 from cosim.place.street_map import Port
 from cosim.spec.scenario import City, CityMap
+from scenarios.catalog import load_suite
 from sumo_nets.city.store import build_city
 from sumo_nets.maps import importer
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.importer import Options
 from sumo_nets.maps.mapstore import (
+    ABOUT,
     about_map,
     checked_map,
     import_map,
     known_maps,
     map_name,
     map_net,
+    outdated,
     read_map,
 )
 from sumo_nets.maps.signalcheck import mend_signals
@@ -44,7 +47,6 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 
 MAPS = Path(__file__).parents[3] / "shared" / "maps"
 NAMES = sorted(p.name for p in MAPS.glob("*") if (p / "stats.json").exists()) if MAPS.is_dir() else []
-CAR_ONLY = ("hamburg-tavf", "eichstaett-crowdnav", "braunschweig-bs3d")
 SAMPLE = (
     "berlin-doerpfeldstr", "berlin-neukoelln", "braunschweig-bs3d", "frederiksted", "london-st-georges", "taipei",
     "west-oakland",
@@ -164,17 +166,52 @@ def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
 
 
 @pytest.mark.engine
-def test_nets_for_cars_alone_need_upgrade(tmp_path: Path) -> None:
-    """Without --upgrade they are refused with the advice; with it they get sidewalks that are said to be guessed."""
+def test_nets_for_cars_alone_get_walkways(tmp_path: Path) -> None:
+    """A net without sidewalks gets them, as one of its changes, and they are said to be guessed."""
     source = written(tmp_path / "town.osm", osm(sidewalk=""))
     net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
-    before = kept()
-    with pytest.raises(MapError, match="with --upgrade"):
-        import_map(net)
-    assert kept() == before
-    about = import_map(net, options=Options(upgrade=True))
+    about = import_map(net)
     _, check, _ = checked_map("cars")
     assert check.usable and about.guessed_share is not None and about.guessed_share > 0.9
+    assert any("crossings and walking areas added" in change for change in about.changes)
+
+
+@pytest.mark.engine
+def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
+    """With --as-is the net stays the same to the byte, and the changes say what is not possible on it."""
+    source = written(tmp_path / "town.osm", osm(sidewalk=""))
+    net = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
+    about = import_map(net, options=Options(as_is=True))
+    assert map_net("cars").read_bytes() == net.read_bytes() and about.as_is
+    assert "no crowd, no route and no scenario is possible" in about.changes[-1]
+    _, check, _ = checked_map("cars")
+    assert not check.usable
+    with pytest.raises(UsageError, match="an OpenStreetMap file is always converted"):
+        import_map(source, options=Options(as_is=True))
+
+
+@pytest.mark.engine
+@pytest.mark.parametrize("name", ["ingolstadt-1", "braunschweig-2"])
+def test_shipped_places_keep_their_import(name: str) -> None:
+    """The shipped places are imported by the version of their suites: their nets have the hashes of the scenarios."""
+    about = about_map(name)
+    frozen = {s.place.net_hash for s in load_suite("unit").scenarios if s.place.name == f"map-{name}"}
+    assert {about.net_hash} == frozen and about.versions["importer"] == "3"
+    assert not outdated(about)
+
+
+@pytest.mark.engine
+def test_maps_of_an_older_importer_stay_usable(tmp_path: Path) -> None:
+    """A map that version 3 kept is read as it was, its check advises a new import, and that replaces it."""
+    source = written(tmp_path / "town.osm", osm())
+    import_map(source, "old")
+    path = map_net("old").with_name(ABOUT)
+    kept_by_3 = json.loads(path.read_bytes()) | {"upgrade": False}
+    kept_by_3["versions"]["importer"] = "3"
+    del kept_by_3["as_is"]
+    path.write_bytes(json.dumps(kept_by_3).encode())
+    street_map, _, about = checked_map("old")
+    assert street_map.strips and outdated(about) and not outdated(import_map(source, "old"))
 
 
 @pytest.mark.engine
@@ -349,8 +386,8 @@ def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
     cars = netconvert(["--osm-files", str(source)], tmp_path / "cars.net.xml")
     done = cosim("map", "check", str(cars))
     assert done.returncode == 2 and "NOT USABLE" in done.stdout
-    done = cosim("map", "import", str(cars))
-    assert done.returncode == 2 and "--upgrade" in done.stderr and "Traceback" not in done.stderr
+    done = cosim("map", "import", str(cars), "--as-is")
+    assert done.returncode == 2 and "import it without --as-is" in done.stdout, done.stderr
 
 
 def spoiled(draw: st.DrawFn, data: bytes) -> bytes:
@@ -409,19 +446,19 @@ def test_reading_damaged_nets_ends_in_a_map_or_a_map_error(
 
 @pytest.mark.engine
 @settings(max_examples=12)
-@given(data=st.one_of(spoiled_nets(), spoiled_osm()), upgrade=st.booleans())
+@given(data=st.one_of(spoiled_nets(), spoiled_osm()), as_is=st.booleans())
 def test_importing_damaged_files_ends_in_a_map_or_a_map_error(
-    tmp_path_factory: pytest.TempPathFactory, data: bytes, upgrade: bool
+    tmp_path_factory: pytest.TempPathFactory, data: bytes, as_is: bool
 ) -> None:
     """import_map raises MapError or keeps a whole map, never anything between."""
     path, before = tmp_path_factory.mktemp("spoiled") / "spoiled.xml", kept()
     path.write_bytes(data)
     try:
-        import_map(path, "spoiled", Options(upgrade=upgrade))
-    except MapError:
+        import_map(path, "spoiled", Options(as_is=as_is))
+    except (MapError, UsageError):
         assert kept() == before
     else:
-        assert read_map("spoiled").strips
+        assert read_map("spoiled").strips or as_is
 
 
 @pytest.mark.engine
@@ -434,7 +471,7 @@ def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
     stats = json.loads((MAPS / name / "stats.json").read_text())
     raw = MAPS / name / stats["meta"]["raw"]
     source = raw if raw.exists() else MAPS / name / stats["meta"]["net"]
-    about = import_map(source, name, Options(upgrade=name in CAR_ONLY))
+    about = import_map(source, name)
     _, check, _ = checked_map(name)
     measured_km = stats[stats["meta"]["net"]]["stat"]["walkable_km"]
     assert check.facts is not None and check.facts.walkable_km == pytest.approx(measured_km, rel=0.05)
@@ -445,11 +482,8 @@ def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
 
 @pytest.mark.engine
 @pytest.mark.skipif(not NAMES, reason="no shared maps beside the repository")
-@pytest.mark.parametrize("name", [*CAR_ONLY, "zz-empty-roundabout"])
-def test_shared_maps_that_are_refused(name: str) -> None:
-    """Nets for cars alone without --upgrade, and the map of which nothing is left, are refused with the reason."""
-    meta = json.loads((MAPS / name / "stats.json").read_text())["meta"]
-    reason = "--upgrade" if name in CAR_ONLY else "no street of the file survived"
-    with pytest.raises(MapError, match=reason):
-        import_map(MAPS / name / meta["raw"], "refused")
+def test_a_shared_map_that_is_refused() -> None:
+    """The map of which nothing is left is refused with the reason."""
+    with pytest.raises(MapError, match="no street of the file survived"):
+        import_map(MAPS / "zz-empty-roundabout" / "input.osm.gz", "refused")
     assert "refused" not in kept()

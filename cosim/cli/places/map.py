@@ -24,6 +24,10 @@ if TYPE_CHECKING:
     from cosim.place.street_map import StreetMap
     from sumo_nets.maps.mapstore import About
 
+_OUTDATED = (
+    "an older version of the importer made this map: import its file again for wider sidewalks and longer greens"
+)
+
 map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="Cities of the real world: SUMO and OSM.")
 
 
@@ -31,7 +35,7 @@ map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="C
     "import",
     epilog="Examples:  \n"
     "`cosim map import berlin.osm.pbf --bbox 13.43,52.46,13.45,52.48`  \n"
-    "`cosim map import hamburg.net.xml.gz --upgrade`",
+    "`cosim map import hamburg.net.xml.gz`",
 )
 def import_(
     file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
@@ -42,15 +46,15 @@ def import_(
     lefthand: Annotated[
         bool | None, typer.Option("--lefthand/--righthand", help="Side people drive on; by default looked up.")
     ] = None,
-    upgrade: Annotated[
-        bool, typer.Option("--upgrade", help="Give a net for cars alone sidewalks and crossings.")
+    as_is: Annotated[
+        bool, typer.Option("--as-is", help="Leave a SUMO net unchanged: add no sidewalks and crossings, mend nothing.")
     ] = False,
 ) -> None:
     """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
     from sumo_nets.maps.importer import Options
     from sumo_nets.maps.mapstore import checked_map, import_map
 
-    options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, upgrade=upgrade)
+    options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, as_is=as_is)
     with doing(f"converting {file.name}") as tell:
         about = import_map(file, name, options)
         tell(f"checking {about.name}")
@@ -141,6 +145,8 @@ def list_() -> None:
 
 def print_check(check: MapCheck, about: About | None) -> None:
     """A check in words."""
+    from sumo_nets.maps.mapstore import outdated
+
     width_m, height_m = check.size_m
     table = Table(check.name, "", box=box.SIMPLE_HEAD)
     for what, value in _rows(check):
@@ -149,6 +155,7 @@ def print_check(check: MapCheck, about: About | None) -> None:
     print_fitted(out, table, words=[1])
     said = [("note", note) for note in check.notes]
     if about is not None:
+        said += [("note", _OUTDATED)] if outdated(about) else []
         said += [("changed", change) for change in about.changes]
         said += [("licence", licence) for licence in about.licences or ("none found: ask where the file comes from",)]
     said += [("NOT USABLE", reason) for reason in check.reasons]
