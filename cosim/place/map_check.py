@@ -283,7 +283,7 @@ def _unusable(street_map: StreetMap, unit: list[str], long_horizon: list[str]) -
     if not street_map.strips:
         return ["nothing is walkable: no sidewalk, path or crossing"]
     if not street_map.corners:
-        return ["its sidewalks are not connected: the net has no walking areas; import it with --upgrade"]
+        return ["its sidewalks are not connected: the net has no walking areas; import it without --as-is"]
     return [*unit, *long_horizon] if unit and long_horizon else []
 
 

@@ -24,7 +24,7 @@ from cosim.place.street_map import Feature
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.featurefit import fitted
-from sumo_nets.maps.importrules import NEWEST, Rules
+from sumo_nets.maps.importrules import NEWEST_RULES, Rules
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.net.netconvert import complaints, netconvert
@@ -78,7 +78,7 @@ class Options:
     bbox: _Box | None = None
     lefthand: bool | None = None
     as_is: bool = False
-    rules: Rules = NEWEST
+    rules: Rules = NEWEST_RULES
 
     def __post_init__(self) -> None:
         if self.bbox is not None:

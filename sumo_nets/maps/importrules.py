@@ -24,7 +24,7 @@ class Rules:
     mends: tuple[Callable[[ET.Element], list[str]], ...]
 
 
-SHIPPED: Final = Rules(3, {}, (mend_signals,))
+SUITE_RULES: Final = Rules(3, {}, (mend_signals,))
 """The version that imports the SUMO nets of the shipped places: the suites hold the hashes of these nets."""
-NEWEST: Final = Rules(4, {}, (mend_signals,))
+NEWEST_RULES: Final = Rules(4, {}, (mend_signals,))
 """The version that imports everything else."""

@@ -20,7 +20,7 @@ from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
 from sumo_nets.maps.featurefile import NAME, read_features, with_features, write_features
 from sumo_nets.maps.importer import OSM_LICENCE, Options, convert
-from sumo_nets.maps.importrules import NEWEST, SHIPPED
+from sumo_nets.maps.importrules import NEWEST_RULES, SUITE_RULES
 from sumo_nets.maps.rawfile import head_of
 from sumo_nets.maps.scratch import move_in, moving, scratch_in
 from sumo_nets.maps.wheel_places import WHEEL_PLACES
@@ -175,7 +175,7 @@ def known_maps() -> dict[str, Known]:
 
 def outdated(about: About) -> bool:
     """Return whether importing the map again would apply rules that it was imported without."""
-    return about.name not in _supplied() and about.versions.get("importer") != str(NEWEST.version)
+    return about.name not in _supplied() and about.versions.get("importer") != str(NEWEST_RULES.version)
 
 
 def _source_of(name: str) -> str:
@@ -245,7 +245,7 @@ def _supplied() -> dict[str, Path]:
 def _options_of(name: str) -> Options:
     """How a place that comes with SUMO is imported."""
     one = WHEEL_PLACES.get(name)
-    return Options(rules=SHIPPED) if one is None else Options(bbox=one.box, rules=one.rules)
+    return Options(rules=SUITE_RULES) if one is None else Options(bbox=one.box, rules=one.rules)
 
 
 @cache

@@ -16,7 +16,7 @@ import msgspec
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
 from cosim.spec.scenario import City, CityMap, Place
 from sumo_nets.city.store import ABOUT_NAME, GENERATOR, NET_NAME, city_net
-from sumo_nets.maps.importrules import NEWEST
+from sumo_nets.maps.importrules import NEWEST_RULES
 from sumo_nets.maps.mapstore import (
     ABOUT,
     About,
@@ -134,7 +134,7 @@ def _adopted(folder: Path) -> str:
 def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> str:
     """The wanted name, or one with a part of the content's hash where another map has it."""
     names = known_maps()
-    for name in (wanted, f"{wanted[:57]}-{content[:6]}", f"{wanted[:54]}-{content[:6]}-v{NEWEST.version}"):
+    for name in (wanted, f"{wanted[:57]}-{content[:6]}", f"{wanted[:54]}-{content[:6]}-v{NEWEST_RULES.version}"):
         if name not in names:
             return name
         with suppress(MapError):
@@ -146,4 +146,4 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
 def _as_it_is(about: About) -> bool:
     """Whether a map was imported by this version with no options."""
     plain = about.bbox is None and about.lefthand is None and not about.as_is
-    return plain and about.versions.get("importer") == str(NEWEST.version)
+    return plain and about.versions.get("importer") == str(NEWEST_RULES.version)

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-from sumo_nets.maps.importrules import SHIPPED, Rules
+from sumo_nets.maps.importrules import SUITE_RULES, Rules
 
 _Box = tuple[float, float, float, float]
 
@@ -27,7 +27,7 @@ class WheelPlace(NamedTuple):
     net: str
     box: _Box | None = None
     osm: bool = False
-    rules: Rules = SHIPPED
+    rules: Rules = SUITE_RULES
 
     @property
     def path(self) -> Path:
