@@ -43,6 +43,8 @@ _HOST: Final = re.compile(r"(?=.{1,253}$)[A-Za-z0-9]([A-Za-z0-9-]{0,62})(\.[A-Za
 def make_authority(folder: Path, hosts: Sequence[str], days: int, now: datetime | None = None) -> None:
     """Make a folder with a new authority and the certificate of a coordinator. Raises UsageError when it is there."""
     names = [_name(host) for host in hosts]
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"{folder} is a file: name a folder that is not there yet, like certs")
     if folder.exists() and any(folder.iterdir()):
         raise UsageError(f"{folder} is not empty: `cosim certs role {folder} ROLE` adds to an authority that is there")
     now = datetime.now(UTC) if now is None else now

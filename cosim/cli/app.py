@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from typing import Annotated
+from typing import Annotated, NoReturn
 
 import typer
 from rich.markup import escape
@@ -14,6 +14,7 @@ from cosim.cli.network.certs import certs_app
 from cosim.cli.network.direct import direct_app
 from cosim.cli.network.live import live_app
 from cosim.cli.network.serve import serve_app
+from cosim.cli.options.file_path import with_paths_checked
 from cosim.cli.options.panels import LEARN, MEASURE, PLACES, STEP_IN
 from cosim.cli.pictures.export import export_app
 from cosim.cli.pictures.film import film_app
@@ -39,7 +40,7 @@ from cosim.cli.suites.scenario import scenario_app
 from cosim.cli.suites.suite import suite_app
 from cosim.cli.terminal.consoles import err
 from cosim.cli.terminal.streams import told_streams
-from cosim.core.errors import CosimError
+from cosim.core.errors import CosimError, of_file
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -92,10 +93,18 @@ def main() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     with told_streams():
         try:
-            app()
+            with_paths_checked(typer.main.get_command(app))()
         except CosimError as error:
-            err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
-            raise SystemExit(error.exit_code) from None
+            _end(error)
+        except OSError as error:
+            if error.filename is None:
+                raise
+            _end(of_file(error))
+
+
+def _end(error: CosimError) -> NoReturn:
+    err.print(f"[red]error:[/] {escape(str(error))}", soft_wrap=True, highlight=False)
+    raise SystemExit(error.exit_code) from None
 
 
 if __name__ == "__main__":

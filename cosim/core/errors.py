@@ -16,6 +16,8 @@ CosimError                what a user can mend: shown as one message
 
 from __future__ import annotations
 
+import errno
+import os
 from collections.abc import Iterable
 from difflib import get_close_matches
 from pathlib import Path
@@ -36,6 +38,10 @@ MOST_LISTED = 30
 
 _MOST_LETTERS = 100
 """Of a name that is compared with valid ones."""
+_SHOWN_LETTERS = 60
+"""Of a path that is too long."""
+_LONGEST_NAME_BYTES = 255
+_LONGEST_PATH_BYTES = 4095
 
 
 class CosimError(Exception):
@@ -116,9 +122,28 @@ class MachineError(CosimError):
     exit_code = BROKEN_MACHINE
 
 
-def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError:
+def too_long(path: str | Path) -> UsageError:
+    """The error for the path of a file or folder that no file system takes."""
+    size = max(len(os.fsencode(part)) for part in Path(path).parts)
+    shown = str(path) if len(str(path)) <= _SHOWN_LETTERS else f"{str(path)[:_SHOWN_LETTERS]}..."
+    what = f"a name in it has {size} bytes" if size > _LONGEST_NAME_BYTES else f"it has {len(os.fsencode(path))} bytes"
+    return UsageError(
+        f"{shown}: the path is too long: {what}. A name may have {_LONGEST_NAME_BYTES} bytes, and a path "
+        f"{_LONGEST_PATH_BYTES}: choose a shorter one"
+    )
+
+
+def of_file(error: OSError) -> CosimError:
+    """The error for a file that the system refuses, where nothing more is known of it than its path."""
+    name = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else str(error.filename)
+    return too_long(name) if error.errno == errno.ENAMETOOLONG else MachineError(f"{name}: {error.strerror}")
+
+
+def unwritable(path: Path, error: OSError, remedy: str = "") -> MachineError | UsageError:
     """The error for a file or folder that cannot be written. Where its path leads through a file, or is one and should
-    be a folder, that is the reason; and unless there is a remedy, another path is."""
+    be a folder, that is the reason; and unless there is a remedy, another path is. Its name may be too long."""
+    if error.errno == errno.ENAMETOOLONG:
+        return too_long(path)
     reason = error.strerror or str(error)
     if isinstance(error, FileExistsError | NotADirectoryError):
         for file in (path, *path.parents):

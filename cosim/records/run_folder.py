@@ -324,10 +324,13 @@ def refuse_in_use(path: Path) -> None:
 
 def _refuse_used(path: Path) -> None:
     """Raises RunError when a folder holds a run, or something else that is not a run's beginning."""
-    if (path / "run.json").exists():
-        raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
-    if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
-        raise RunError(f"{path} exists and is no run folder. Choose another --out.")
+    try:
+        if (path / "run.json").exists():
+            raise RunError(f"{path} already holds a run. Add --resume to finish it, or choose another --out.")
+        if path.exists() and (not path.is_dir() or {p.name for p in path.iterdir()} - UNFINISHED):
+            raise RunError(f"{path} exists and is no run folder. Choose another --out.")
+    except OSError as error:
+        raise unwritable(path, error) from error
 
 
 def _locked(path: Path) -> int:

@@ -1,0 +1,83 @@
+"""Names of files and folders that cannot be: one clear line, exit code 2, before any work is done."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import Cosim
+
+LONG = "a" * 300
+RUN = ("run", "reactive", "--policy", "straight", "--scenario", "obstructing-001")
+WRITES: tuple[tuple[str, ...], ...] = (
+    (*RUN, "--out", LONG),
+    (*RUN, "--rerun", f"{LONG}.rrd"),
+    (*RUN, "--log-json", LONG),
+    ("coordinator", "reactive", "--policy", "straight", "--episodes", "1", "--out", LONG),
+    ("collect", "reactive", "--out", LONG, "--episodes", "1"),
+    ("scenario", "run", "mine.toml", "--policy", "straight", "--out", LONG),
+    ("scenario", "new", f"{LONG}.toml"),
+    ("scenario", "draw", "mine.toml", "-o", f"{LONG}.png"),
+    ("suite", "build", "unit", f"{LONG}.json", "--only", "straight-001"),
+    ("city", "make", "--seed", "1", "--size", "300", LONG),
+    ("city", "draw", "1", "--size", "300", "-o", f"{LONG}.png"),
+    ("map", "check", "sumo-fkk-in", "-o", f"{LONG}.png"),
+    ("look", "obstructing-001", "-o", f"{LONG}.png"),
+    ("film", "run", "obstructing-001", "-o", f"{LONG}.mp4"),
+    ("report", "run", "-o", f"{LONG}.html"),
+    ("export", "obstructing-001", f"{LONG}.glb"),
+    ("show", "run", "--episode", "obstructing-001", "-o", f"{LONG}.png"),
+    ("compare", "run", "run", "-o", f"{LONG}.csv"),
+    ("merge", "run", "run", "--out", LONG),
+    ("dataset", "pack", "demos", "-o", f"{LONG}.npz"),
+    ("train", "demos.npz", "-o", LONG),
+    ("policy", "check", "straight", "-o", f"{LONG}.png", "--only", "finite"),
+    ("certs", "init", LONG),
+)
+READS: tuple[tuple[str, ...], ...] = (
+    ("show", LONG),
+    ("score", LONG),
+    ("run", LONG),
+    ("run", "reactive", "--policy", f"onnx:{LONG}"),
+    ("run", "reactive", "--map", LONG),
+    ("map", "import", LONG),
+    ("scenario", "check", LONG),
+    ("certs", "role", LONG, "viewer"),
+    ("status", LONG),
+)
+
+
+@pytest.mark.parametrize("words", [*WRITES, *READS], ids=lambda words: " ".join(words).replace(LONG, "LONG"))
+def test_a_name_that_is_too_long_is_refused_in_one_line(tmp_path: Path, cosim: Cosim, words: tuple[str, ...]) -> None:
+    """Whatever it names, to be written or read: exit code 2, no traceback, and nothing is left."""
+    (tmp_path / "mine.toml").write_text('name = "mine"\n[place]\ncity = 1\n[way]\nkind = "straight"\n')
+    said = cosim(*words, cwd=tmp_path)
+    assert said.returncode == 2, said
+    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    assert {path.name for path in tmp_path.iterdir()} == {"mine.toml"}
+
+
+FOLDERS: tuple[tuple[str, ...], ...] = (
+    ("certs", "init", "file"),
+    ("certs", "role", "file", "viewer"),
+    ("certs", "show", "file"),
+    (*RUN, "--out", "file"),
+    ("collect", "reactive", "--out", "file", "--episodes", "1"),
+    ("city", "make", "--seed", "1", "--size", "300", "file"),
+    ("merge", "file", "file", "--out", "file"),
+    ("show", "file"),
+    ("score", "file/below"),
+)
+
+
+@pytest.mark.parametrize("words", FOLDERS, ids=" ".join)
+def test_a_file_in_the_place_of_a_folder_is_refused_in_one_line(
+    tmp_path: Path, cosim: Cosim, words: tuple[str, ...]
+) -> None:
+    """Of certificates, of a run, of data: the file stays as it was."""
+    (tmp_path / "file").write_text("mine")
+    said = cosim(*words, cwd=tmp_path)
+    assert said.returncode in (2, 3), said
+    assert said.stderr.strip().splitlines()[-1].startswith("error: "), said
+    assert {path.name for path in tmp_path.iterdir()} == {"file"} and (tmp_path / "file").read_text() == "mine"
