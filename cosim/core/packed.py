@@ -30,6 +30,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError, unwritable
+from cosim.core.npz import NO_NPZ
 
 _FORMAT: Final = 1
 
@@ -91,7 +92,7 @@ def packed_digest(path: Path) -> str:
     try:
         with zipfile.ZipFile(path) as held:
             told = [(one.filename, one.file_size, one.CRC) for one in held.infolist()]
-    except (OSError, zipfile.BadZipFile) as error:
+    except (OSError, *NO_NPZ) as error:
         raise _none_in(path, error) from error
     return hashlib.blake2b(repr(told).encode(), digest_size=8).hexdigest()
 
@@ -104,7 +105,7 @@ def read_packed(path: Path) -> Packed:
             arrays = {one.name: held[one.name] for one in fields(Packed) if one.name != "meta"}
         if meta.pop("format") != _FORMAT or len({len(array) for array in arrays.values()}) != 1:
             raise ValueError("its arrays are of different lengths, or of another format")
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (OSError, *NO_NPZ) as error:
         raise _none_in(path, error) from error
     return Packed(**arrays, meta=meta)
 

@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import io
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from dataclasses import field as filled
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
+from cosim.core.npz import read_npz
 
 _OF_PLANS = {"plan_sizes", "plan_points", "plan_index"}
 _LATER = {"answers"} | _OF_PLANS
 """What a file need not have."""
+_COLUMNS = {
+    "pose": 3, "speed": 2, "command": 2, "route_s_m": 0, "travelled_m": 0, "person_m": 0, "clearance_m": 0,
+    "collision_in_s": 0, "reset_s_m": 0, "waits_at_red": 0, "on_carriageway": 0, "vehicles_braked": 0,
+}  # fmt: skip
+"""How many columns each array with a row for each tick has, 0 for one without columns."""
+_OF_PEOPLE = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 0}
 
 
 def holds_waypoints(path: Path) -> bool:
@@ -107,15 +115,29 @@ class Log:
     def load(cls, path: Path) -> Log:
         """Read a saved log. Raises RunError naming the file."""
         try:
-            with np.load(path, allow_pickle=False) as arrays:
-                held = dict(arrays)
-                values = {f.name: held[f.name] for f in fields(cls) if f.name in held or f.name not in _LATER}
+            held = read_npz(path)
+            values: dict[str, Any] = {
+                f.name: held[f.name] for f in fields(cls) if f.name in held or f.name not in _LATER
+            }
             if values.keys() & _OF_PLANS:
                 counts = len(held["plan_sizes"]), held["plan_sizes"].sum()
                 if counts != (len(held["answers"]), len(held["plan_points"])):
                     raise ValueError("plan_sizes, plan_points and answers are not of each other")
                 values["plan_index"] = int(held["plan_index"])
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            values["tick_s"] = float(values["tick_s"])
+            _check_shapes(values)
+        except KeyError as error:
+            raise RunError(f"{path}: not a trajectory: has no array {error}") from error
+        except (OSError, TypeError, ValueError) as error:
             raise RunError(f"{path}: not a trajectory: {error}") from error
-        values["tick_s"] = float(values["tick_s"])
         return cls(**values)
+
+
+def _check_shapes(held: Mapping[str, Any]) -> None:
+    """Raises ValueError for an array that holds no numbers, has other columns, or not as many rows as it should."""
+    tables = [(_COLUMNS, len(np.atleast_1d(held["pose"]))), (_OF_PEOPLE, len(np.atleast_1d(held["people_tick"])))]
+    for columns, rows in (*tables, ({"event_tracks": 5}, len(np.atleast_1d(held["event_tracks"])))):
+        for name, width in columns.items():
+            array, shape = held[name], (rows, width) if width else (rows,)
+            if array.dtype.kind not in "biuf" or array.shape != shape:
+                raise ValueError(f"'{name}' is {array.dtype.name} {array.shape}; wanted are numbers {shape}")

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import msgspec
-import numpy as np
 import pandas as pd
 
 from cosim.core.errors import RunError, unwritable
+from cosim.core.npz import read_npz
 from cosim.core.telling import Tell
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder, read_records, read_spec, refuse_in_use
@@ -140,12 +140,10 @@ def _same_arrays(one: Path, other: Path) -> bool:
     if one.read_bytes() == other.read_bytes():
         return True
     try:
-        with np.load(one, allow_pickle=False) as mine, np.load(other, allow_pickle=False) as theirs:
-            alike = {*mine} == {*theirs}
-            return alike and all(
-                mine[name].dtype == theirs[name].dtype and mine[name].tobytes() == theirs[name].tobytes()
-                for name in mine
-            )
+        mine, theirs = read_npz(one), read_npz(other)
+        return {*mine} == {*theirs} and all(
+            mine[name].dtype == theirs[name].dtype and mine[name].tobytes() == theirs[name].tobytes() for name in mine
+        )
     except (OSError, ValueError) as error:
         raise RunError(f"{one} and {other}: one is no trajectory: {error}") from error
 

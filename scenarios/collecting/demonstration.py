@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
+from cosim.core.npz import arrays_in
 
 _GLIMPSE_PX: Final = (8, 6)
 _STRAIGHT_RADPS: Final = 1e-6
@@ -52,9 +52,10 @@ class Demonstration:
     def decoded(cls, data: bytes, where: object) -> Demonstration:
         """One that was encoded. where: what an error names. Raises RunError."""
         try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as held:
-                return cls(**{one.name: held[one.name] for one in fields(cls)})
-        except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as error:
+            names = [one.name for one in fields(cls)]
+            held = arrays_in(io.BytesIO(data), names)
+            return cls(**{name: held[name] for name in names})
+        except ValueError as error:
             raise RunError(f"{where}: no demonstration: {error}: collect it anew, in another --out") from error
 
 

@@ -6,7 +6,7 @@ import math
 from typing import Final
 
 from cosim.core.clock import Clock
-from cosim.core.errors import PolicyError
+from cosim.core.errors import PolicyError, UsageError
 from cosim.spec.robot import COURIER
 from scenarios.policy_check.asking import ROUNDING, Asker, apart
 from scenarios.policy_check.drives import SCENES
@@ -144,7 +144,10 @@ def example(asker: Asker) -> CheckOutcome:
         return inapplicable("it is no ONNX bundle")
     if not policy.example.exists():
         return doubted(f"{policy.example.name} is missing: right, but nothing tells whether it is the right graph")
-    found = example_differences(policy)
+    try:
+        found = example_differences(policy)
+    except UsageError as error:
+        return failed(str(error))
     if not found:
         return doubted(f"{policy.example.name} expects nothing: right, but nothing tells whether it is the right graph")
     off = {name: differ for name, differ in found.items() if not differ <= ROUNDING}

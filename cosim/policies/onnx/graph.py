@@ -25,6 +25,8 @@ _PLACES: Final = re.compile(
 _MOST_SAID: Final = 400
 
 Tensor = NDArray[Any]
+NUMBERS: Final = "biuf"
+"""The kinds of numpy that the tensors of a graph may be."""
 
 _TYPES: Final[Mapping[str, Any]] = {
     "tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64,
@@ -40,6 +42,13 @@ class TensorPort:
     name: str
     dtype: np.dtype[Any]
     shape: tuple[int | None, ...]
+
+    def takes(self, array: Tensor) -> bool:
+        """Whether an array has this type and shape."""
+        fits = len(array.shape) == len(self.shape) and all(
+            mine in (None, theirs) for mine, theirs in zip(self.shape, array.shape, strict=True)
+        )
+        return fits and array.dtype == self.dtype
 
     @property
     def in_words(self) -> str:

@@ -5,18 +5,22 @@ An ONNX file is a protobuf message; this reads the few fields of it that are nam
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-_GRAPH_OF_MODEL: Final = 7
-_NODE_OF_GRAPH: Final = 1
-_INITIALIZER_OF_GRAPH: Final = 5
-_ATTRIBUTE_OF_NODE: Final = 5
-_TENSOR_OF_ATTRIBUTE: Final = 5
-_GRAPH_OF_ATTRIBUTE: Final = 6
+_PARTS: Final[Mapping[str, Mapping[int, str]]] = {
+    "model": {7: "graph", 20: "training", 25: "function"},
+    "training": {1: "graph", 2: "graph"},
+    "function": {7: "node", 11: "attribute"},
+    "graph": {1: "node", 5: "tensor", 15: "sparse tensor"},
+    "node": {5: "attribute"},
+    "attribute": {5: "tensor", 6: "graph", 10: "tensor", 11: "graph", 22: "sparse tensor", 23: "sparse tensor"},
+    "sparse tensor": {1: "tensor", 2: "tensor"},
+}
+"""By its fields what each message holds that may hold tensors."""
 _TYPE, _FLOATS, _NAME, _RAW, _DOUBLES, _EXTERNAL = 2, 4, 8, 9, 10, 13
 """Fields of a tensor."""
 _KEY, _VALUE = 1, 2
@@ -67,31 +71,20 @@ def _name(tensor: memoryview) -> str:
 
 
 def _tensors(model: memoryview) -> Iterator[memoryview]:
-    """The weights of a model, those of constants and of graphs within it included."""
-    graphs = [graph for number, graph in _fields(model) if number == _GRAPH_OF_MODEL]
-    if not graphs:
+    """All tensors of a model: its weights, and those of constants, functions and graphs within it."""
+    if not any(_PARTS["model"].get(number) == "graph" for number, _ in _fields(model)):
         raise ValueError("has no graph")
-    while graphs:
-        graph = graphs.pop()
-        if not isinstance(graph, memoryview):
-            raise ValueError("has no graph")
-        for number, part in _fields(graph):
-            if not isinstance(part, memoryview):
-                continue
-            if number == _INITIALIZER_OF_GRAPH:
-                yield part
-            elif number == _NODE_OF_GRAPH:
-                for _, attribute in filter(_is_attribute, _fields(part)):
-                    assert isinstance(attribute, memoryview)
-                    for kind, held in _fields(attribute):
-                        if kind == _TENSOR_OF_ATTRIBUTE and isinstance(held, memoryview):
-                            yield held
-                        elif kind == _GRAPH_OF_ATTRIBUTE:
-                            graphs.append(held)
-
-
-def _is_attribute(field: _Field) -> bool:
-    return field[0] == _ATTRIBUTE_OF_NODE and isinstance(field[1], memoryview)
+    messages = [("model", model)]
+    while messages:
+        kind, message = messages.pop()
+        if kind == "tensor":
+            yield message
+            continue
+        for number, part in _fields(message):
+            if (held := _PARTS[kind].get(number)) is not None:
+                if not isinstance(part, memoryview):
+                    raise ValueError(f"has a {held} that is none")
+                messages.append((held, part))
 
 
 def _fields(message: memoryview) -> Iterator[_Field]:

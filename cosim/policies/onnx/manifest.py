@@ -22,14 +22,33 @@ from cosim.policies.onnx.inputs import GraphInput, JoinedInput, PastPositionsInp
 from cosim.policies.onnx.outputs import GraphOutput, WaypointsOutput
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
-from cosim.spec.ranges import Named, Ranged, Text, Within
+from cosim.spec.ranges import Named, Ranged, Text, Within, shown
 from cosim.spec.spec_file import read_spec_file
 
 MANIFEST_FILE: Final = "manifest.json"
 EXAMPLE_FILE: Final = "example.npz"
 """For each input of the graph an array of its name, and for each output one of the name `expected.<name>`."""
+MOST_EXAMPLE_BYTES: Final = 512 << 20
+"""Of an example, packed and unpacked."""
 
+_MOST_NAME_BYTES: Final = 255
 _HASH: Final = re.compile(r"[0-9a-f]{64}")
+
+
+def refusal_of_name(name: str) -> str:
+    """Why a file of a bundle cannot be called so; "" if it can. Files of a bundle lie in its folder, not below it.
+
+    >>> refusal_of_name("model.onnx.data"), refusal_of_name("../model.onnx")[:17]
+    ('', "'../model.onnx' i")
+    """
+    if (
+        name.isprintable()
+        and name not in ("", ".", "..")
+        and "/" not in name
+        and len(name.encode()) <= _MOST_NAME_BYTES
+    ):
+        return ""
+    return f"{shown(name)} is no name of a file in the bundle's folder: use a name without '/', such as model.onnx.data"
 
 
 class FileFacts(Ranged, frozen=True, kw_only=True):
@@ -138,6 +157,7 @@ class BundleManifest(Ranged, frozen=True, kw_only=True):
         )
 
     def contradictions(self) -> Iterator[str]:
+        yield from (f"files: {refusal}" for refusal in map(refusal_of_name, self.files) if refusal)
         needs = {name: one.needs for name, one in self.inputs.items() if one.needs}
         if needs and not self.goals:
             yield f"inputs {', '.join(needs)} need goals that no run can give at once: give one of them `missing`"

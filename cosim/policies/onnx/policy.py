@@ -10,15 +10,16 @@ import msgspec
 import numpy as np
 
 from cosim.core.errors import PolicyError, UsageError
+from cosim.core.npz import read_npz
 from cosim.core.state import STILL, Command
 from cosim.episode.control import command_of
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import Manifest, Observation
 from cosim.policies.onnx.answers import PolicyAnswer, answer_of, check_outputs
 from cosim.policies.onnx.feeding import Feeder
-from cosim.policies.onnx.graph import Graph, Tensor, said_by_runtime
+from cosim.policies.onnx.graph import NUMBERS, Graph, Tensor, said_by_runtime
 from cosim.policies.onnx.inputs import StateInput
-from cosim.policies.onnx.manifest import BundleManifest
+from cosim.policies.onnx.manifest import MOST_EXAMPLE_BYTES, BundleManifest
 from cosim.policies.onnx.reading import read_bundle
 from cosim.policies.onnx.weights import bundle_files
 from cosim.spec.goal import Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
@@ -198,17 +199,25 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
     """
     path = policy.example
     try:
-        with np.load(path) as arrays:
-            held: dict[str, Tensor] = {name: arrays[name] for name in arrays.files}
-    except (OSError, ValueError) as error:
-        raise UsageError(f"{path}: cannot be read: {error}") from error
+        held: dict[str, Tensor] = read_npz(path, most_bytes=MOST_EXAMPLE_BYTES)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise UsageError(f"{path}: {error}") from error
     wanted = {name.removeprefix("expected."): array for name, array in held.items() if name.startswith("expected.")}
     if lacking := sorted(policy.graph.inputs.keys() - held.keys()):
-        raise UsageError(f"{path}: has no array '{lacking[0]}'; it has {', '.join(held)}")
+        raise UsageError(f"{path}: has no array '{lacking[0]}'; it has {', '.join(held) or 'none'}")
     if unknown_ones := sorted(wanted.keys() - policy.graph.outputs.keys()):
         raise UsageError(
             f"{path}: has expected.{unknown_ones[0]}; the graph's outputs: {', '.join(policy.graph.outputs)}"
         )
+    for name, array in held.items():
+        port = policy.graph.inputs.get(name)
+        if array.dtype.kind not in NUMBERS or (port is not None and not port.takes(array)):
+            wanted_is = f"the graph takes {port.in_words}" if port else "numbers are wanted"
+            raise UsageError(
+                f"{path}: does not fit the graph: '{name}' is {array.dtype.name} {array.shape}, and {wanted_is}"
+            )
     try:
         told = policy.graph.ask({name: held[name] for name in policy.graph.inputs}, list(policy.graph.outputs))
     except Exception as error:

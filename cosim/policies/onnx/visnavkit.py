@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError, UsageError
+from cosim.core.npz import read_npz
 from cosim.policies.onnx.inputs import (
     ConstantInput,
     GoalPictureInput,
@@ -29,14 +30,16 @@ from cosim.policies.onnx.inputs import (
     SpeedsInput,
     StateInput,
 )
-from cosim.policies.onnx.manifest import BundleCamera, BundleManifest
+from cosim.policies.onnx.manifest import MOST_EXAMPLE_BYTES, BundleCamera, BundleManifest
 from cosim.policies.onnx.outputs import Mixture, WaypointsOutput
+from cosim.policies.onnx.weights import read_file
 from cosim.spec.goal import GoalProtocol
 
 METADATA: Final = ".metadata.json"
 EXAMPLE: Final = ".inputs.npz"
 _FOV_DEG: Final = 60.0
 _WINDOW_HZ, _FRAME_HZ = 20.0, 10.0
+_MOST_METADATA_BYTES: Final = 16 << 20
 _REACHED_S: Final = 0.5
 """Of waypoints at other times each the first that is to be reached no sooner is followed."""
 _AHEAD: Final = (20.0, 1.0, 0.0)
@@ -59,13 +62,10 @@ def manifest_of_export(graph: Path) -> BundleManifest:
     another graph, or of inputs and outputs that are not known."""
     path = graph.with_suffix(METADATA)
     try:
-        told = msgspec.json.decode(path.read_bytes(), type=_Metadata)
-    except (OSError, msgspec.DecodeError) as error:
+        told = msgspec.json.decode(read_file(path, _MOST_METADATA_BYTES), type=_Metadata)
+    except (msgspec.DecodeError, RecursionError) as error:
         raise UsageError(f"{path}: cannot be read: {error}") from error
-    try:
-        found = hashlib.sha256(graph.read_bytes()).hexdigest()
-    except OSError as error:
-        raise UsageError(f"{graph}: cannot be read: {error.strerror}") from error
+    found = hashlib.sha256(read_file(graph)).hexdigest()
     if told.onnx_sha256 not in ("", found):
         raise UsageError(
             f"{graph}: is another file than {path.name} says: onnx_sha256 is {told.onnx_sha256[:16]}... there, "
@@ -142,9 +142,9 @@ def _example(graph: Path, name: str) -> tuple[float, ...]:
     """The numbers of an input that are the same for every question, as they were when the graph was exported."""
     path = graph.with_suffix(EXAMPLE)
     try:
-        with np.load(path) as arrays:
-            return tuple(arrays[name].astype(float).ravel().tolist())
-    except (OSError, ValueError, KeyError) as error:
+        array = read_npz(path, [name], MOST_EXAMPLE_BYTES)[name]
+        return tuple(array.astype(float).ravel().tolist())
+    except (OSError, TypeError, ValueError) as error:
         raise UsageError(f"{path}: has no {name}, which the graph wants: {error}") from error
 
 

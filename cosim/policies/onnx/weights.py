@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,10 +14,13 @@ from platformdirs import user_data_path
 
 from cosim.core.errors import UsageError
 from cosim.policies.onnx.graph_file import external_files, weights_not_finite
-from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts
+from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, refusal_of_name
 
 WEIGHTS_VARIABLE: Final = "COSIM_WEIGHTS"
 _MOST_BYTES: Final = 8_000_000_000
+_MOST_GRAPH_BYTES: Final = 2 << 30
+"""An ONNX file is a protobuf message, which holds no more; larger weights lie in files beside it."""
+_PIECE_BYTES: Final = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     """The files of the bundle in a folder. Raises UsageError for one that is missing, saying where it is to be had, or
     is another than its manifest says; for a graph that is none, or has weights that are no numbers."""
     graph = _found(folder, manifest, manifest.model)
-    data = _read(graph)
+    data = read_file(graph)
     try:
         beside = external_files(data)
         bad = weights_not_finite(data)
@@ -86,39 +90,74 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
         raise UsageError(f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew")
     digest = hashlib.blake2b(digest_size=32)
     for name in dict.fromkeys([manifest.model, *beside, *manifest.files]):
-        if name in beside and (not name or Path(name).name != name):
-            raise UsageError(f"{graph}: has weights in '{name}': a file of a bundle lies beside its graph")
-        path = graph.with_name(name) if name in beside else _found(folder, manifest, name)
-        held = data if path == graph else _read(path)
-        _check(path, held, manifest)
-        digest.update(f"{name}\0{len(held)}\0".encode() + held)
+        if name in beside and (refusal := refusal_of_name(name)):
+            raise UsageError(f"{graph}: has weights in a file beside it: {refusal}")
+        path = _inside(graph.with_name(name), graph.parent) if name in beside else _found(folder, manifest, name)
+        _digested(path, name, manifest, digest)
     return BundleFiles(graph, digest.hexdigest())
 
 
 def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
-    """Where a file of a bundle is."""
-    return weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
+    """Where a file of a bundle is. Raises UsageError for one in its folder that is a link out of it."""
+    path = weights_file(manifest.name, name, manifest.files.get(name), manifest.source, [folder])
+    return _inside(path, folder) if path.parent == folder else path
 
 
-def _read(path: Path) -> bytes:
+def _inside(path: Path, folder: Path) -> Path:
+    """A file of a bundle's folder. Raises UsageError where it is a link that leads elsewhere."""
+    if path.is_symlink() and not path.resolve().is_relative_to(folder.resolve()):
+        raise UsageError(
+            f"{path}: is a link that leads out of its bundle: put the file there, or in a folder of weights "
+            f"({WEIGHTS_VARIABLE})"
+        )
+    return path
+
+
+def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
+    """All of a file, by default of a graph. Raises UsageError for what is no regular file, and for more bytes."""
+    _size(path, most_bytes)
     try:
-        if (size := path.stat().st_size) > _MOST_BYTES:
-            raise UsageError(f"{path}: holds {size} bytes; at most {_MOST_BYTES} are read")
         return path.read_bytes()
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def _check(path: Path, data: bytes, manifest: BundleManifest) -> None:
-    """Raises UsageError for a file that is another than its manifest says."""
-    said = manifest.files.get(path.name)
-    if said is None:
-        return
-    found = file_facts(data)
-    told = {name: one for name, one in {"bytes": said.bytes, **said.hashes}.items() if one != ""}
-    if off := [name for name, one in told.items() if one != getattr(found, name)]:
-        what = off[0]
-        raise UsageError(
-            f"{path}: is another file than the manifest of '{manifest.name}' says: files.{path.name}.{what} is "
-            f"{getattr(said, what)} there, {getattr(found, what)} found"
-        )
+def _size(path: Path, most_bytes: int) -> int:
+    """How many bytes a file holds. Raises UsageError for what is no regular file, and for more than are read."""
+    try:
+        about = path.stat()
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    if not stat.S_ISREG(about.st_mode):
+        raise UsageError(f"{path}: is no regular file")
+    if about.st_size > most_bytes:
+        raise UsageError(f"{path}: holds {about.st_size} bytes; at most {most_bytes} are read")
+    return about.st_size
+
+
+def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> None:
+    """Take a file into a digest, piece by piece. Raises UsageError for one that is another than its manifest says."""
+    size, said = _size(path, _MOST_BYTES), manifest.files.get(path.name)
+    told: dict[str, int | str] = {} if said is None else {"bytes": said.bytes, **said.hashes}
+
+    def check(what: str, found: int | str) -> None:
+        if told.get(what, "") not in ("", found):
+            raise UsageError(
+                f"{path}: is another file than the manifest of '{manifest.name}' says: files.{path.name}.{what} is "
+                f"{told[what]} there, {found} found"
+            )
+
+    check("bytes", size)
+    digest.update(f"{name}\0{size}\0".encode())
+    blake2b, sha256 = hashlib.blake2b(digest_size=32), hashlib.sha256()
+    try:
+        with path.open("rb") as file:
+            while piece := file.read(_PIECE_BYTES):
+                digest.update(piece)
+                if told:
+                    blake2b.update(piece)
+                    sha256.update(piece)
+    except OSError as error:
+        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    check("blake2b", blake2b.hexdigest())
+    check("sha256", sha256.hexdigest())

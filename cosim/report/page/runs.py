@@ -8,12 +8,11 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal
-from zipfile import BadZipFile
 
-import numpy as np
 import pandas as pd
 
 from cosim.core.errors import RunError, UsageError
+from cosim.core.npz import read_npz
 from cosim.core.telling import Tell, untold
 from cosim.episode.log import Log
 from cosim.records.record import Record
@@ -92,9 +91,8 @@ class ReportedRun:
             if record.status != "done" or not path.exists():
                 continue
             try:
-                with np.load(path, allow_pickle=False) as arrays:
-                    read = {name: arrays[name] for name in _COLUMNS}
-            except (OSError, EOFError, KeyError, ValueError, BadZipFile) as error:
+                read = read_npz(path, _COLUMNS)
+            except (OSError, ValueError) as error:
                 raise RunError(f"{path}: not a trajectory: {error}: {anew(file)}") from error
             yield record, read
 

@@ -1,0 +1,83 @@
+"""Arrays from an .npz file that others made: read within bounds, or refused in words.
+
+Sizes are looked at before anything is read: neither a sparse file nor a few bytes that unpack to gigabytes fill the
+memory. Objects (pickle) are never unpacked.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import stat
+import struct
+import zipfile
+import zlib
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, BinaryIO, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+MOST_NPZ_BYTES: Final = 2 << 30
+_MOST_ARRAYS: Final = 4096
+_ENDING: Final = ".npy"
+_HEADERS: Final = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+NO_NPZ: Final = (
+    EOFError, KeyError, MemoryError, NotImplementedError, OverflowError, RuntimeError, SyntaxError, TypeError,
+    ValueError, struct.error, zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error,
+)  # fmt: skip
+"""What zipfile and numpy raise where a file is damaged, encrypted, packed otherwise, or not one of theirs."""
+
+
+def read_npz(
+    path: Path, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
+) -> dict[str, NDArray[Any]]:
+    """The arrays of a file, by name. only: of these names, each of which must be there.
+
+    Raises ValueError, which says what is wrong: no regular file, no .npz, cut off, damaged, objects in it, or more than
+    `most_bytes`, packed or unpacked. OSError passes.
+    """
+    about = path.stat()
+    if not stat.S_ISREG(about.st_mode):
+        raise ValueError("is no regular file")
+    if about.st_size > most_bytes:
+        raise ValueError(f"holds {about.st_size} bytes; at most {most_bytes} are read")
+    with path.open("rb") as file:
+        return arrays_in(file, only, most_bytes)
+
+
+def arrays_in(
+    file: BinaryIO, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
+) -> dict[str, NDArray[Any]]:
+    """The same of an open file."""
+    try:
+        with zipfile.ZipFile(file) as held:
+            entries = {one.filename.removesuffix(_ENDING): one for one in held.infolist()}
+            size = sum(one.file_size for one in held.infolist())
+            if size > most_bytes or len(held.infolist()) > _MOST_ARRAYS:
+                count = len(held.infolist())
+                raise ValueError(f"unpacks to {count} arrays of {size} bytes; at most {most_bytes} bytes are read")
+            if lacking := sorted({*(only or ())} - entries.keys()):
+                raise ValueError(f"has no array '{lacking[0]}'")
+            names = [name for name in entries if only is None or name in only]
+            return {name: _array(name, held.read(entries[name])) for name in names}
+    except NO_NPZ as error:
+        why = f"{error}" or type(error).__name__
+        raise ValueError(f"cannot be read as .npz: {why}") from error
+
+
+def _array(name: str, data: bytes) -> NDArray[Any]:
+    """The array in the bytes of an .npy file."""
+    file = io.BytesIO(data)
+    version = np.lib.format.read_magic(file)
+    if version not in _HEADERS:
+        raise ValueError(f"'{name}' is of another version of .npy: {version}")
+    shape, by_columns, dtype = _HEADERS[version](file)
+    if dtype.hasobject:
+        raise ValueError(f"'{name}' holds objects of Python, which are never unpacked: save it as an array of numbers")
+    size = len(data) - file.tell()
+    if math.prod(shape) * dtype.itemsize != size:
+        raise ValueError(f"'{name}' should hold {shape} of {dtype}, and has {size} bytes")
+    array: NDArray[Any] = np.frombuffer(bytearray(data[file.tell() :]), dtype)
+    return array.reshape(shape, order="F" if by_columns else "C")
