@@ -47,6 +47,15 @@ def read_npz(
         return arrays_in(file, only, most_bytes)
 
 
+def names_in_npz(path: Path) -> list[str]:
+    """The names of the arrays of a file, which are not read. Raises ValueError for what is no .npz; OSError passes."""
+    try:
+        with zipfile.ZipFile(path) as held:
+            return [name.removesuffix(_ENDING) for name in held.namelist()]
+    except NO_NPZ as error:
+        raise ValueError(f"cannot be read as .npz: {error}") from error
+
+
 def arrays_in(
     file: BinaryIO, only: Collection[str] | None = None, most_bytes: int = MOST_NPZ_BYTES
 ) -> dict[str, NDArray[Any]]:

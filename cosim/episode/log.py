@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import RunError
 from cosim.core.geometry import Floats
-from cosim.core.npz import read_npz
+from cosim.core.npz import names_in_npz, read_npz
 
 _OF_PLANS = {"plan_sizes", "plan_points", "plan_index"}
 _LATER = {"answers"} | _OF_PLANS
@@ -30,9 +30,8 @@ _OF_PEOPLE = {"people_tick": 0, "people_xy": 2, "people_kind": 0, "people_age": 
 def holds_waypoints(path: Path) -> bool:
     """Return whether a trajectory.npz has answers that were waypoints; False for a file that cannot be read."""
     try:
-        with zipfile.ZipFile(path) as file:
-            return "plan_points.npy" in file.namelist()
-    except (OSError, zipfile.BadZipFile):
+        return "plan_points" in names_in_npz(path)
+    except (OSError, ValueError):
         return False
 
 
