@@ -15,7 +15,6 @@ from cosim.core.geometry import Floats
 from cosim.judge.metrics import COUNTERFACTUAL, METRICS, POOLED
 from cosim.records.paired import PairedDifference, difference_of_means, difference_of_rates
 from cosim.records.results import not_to_be_quoted, table_of
-from cosim.records.run_spec import RunSpec
 from cosim.records.whole_run import WholeRun, read_whole_run
 from cosim.spec.scenario import Scenario
 
@@ -63,7 +62,8 @@ def compare_runs(paths: Sequence[Path]) -> RunComparison:
     )
     groups = groups_of(runs[0].spec.suite, runs[0].scenarios.values())
     pairs = [(before, other) for other in others]
-    differences = pd.concat([differences_of(*pair, groups) for pair in pairs], ignore_index=True)
+    compared = [differences_of(*pair, groups, judged=not _terms_apart(*pair)) for pair in pairs]
+    differences = pd.concat(compared, ignore_index=True)
     flipped = pd.concat([flipped_between(*pair) for pair in pairs], ignore_index=True)
     notes = (*_notes(runs, [before, *others]), *_lonely(pairs))
     return RunComparison(runs[0].spec.suite, before, tuple(others), differences, flipped, notes)
@@ -85,9 +85,11 @@ def groups_of(suite: str, scenarios: Iterable[Scenario]) -> dict[tuple[str, str]
     return found
 
 
-def differences_of(before: ComparedRun, after: ComparedRun, groups: Groups, names: Sequence[str] = ()) -> pd.DataFrame:
+def differences_of(
+    before: ComparedRun, after: ComparedRun, groups: Groups, names: Sequence[str] = (), judged: bool = True
+) -> pd.DataFrame:
     """A row for each group and metric, `DIFFERENCES`: over the scenarios that both runs have. names: of metrics; all
-    that both have where none is named."""
+    that both have where none is named. judged: whether a difference is called better or worse; else it "differs"."""
     one, other = (run.table.set_index("scenario") for run in (before, after))
     ids = [name for name in one.index if name in other.index]
     names = names or [name for name in (*METRICS, *COUNTERFACTUAL) if name in one.columns and name in other.columns]
@@ -101,7 +103,7 @@ def differences_of(before: ComparedRun, after: ComparedRun, groups: Groups, name
             found = _difference(name, *pair)
             unit, better = METRICS[name][:2] if name in METRICS else (COUNTERFACTUAL[name], None)
             values = (found.n, found.before, found.after, found.difference, found.low, found.high, found.changed)
-            verdict = found.verdict(better) if found.n else ""
+            verdict = found.verdict(better if judged else None) if found.n else ""
             rows.append((before.label, after.label, by, group, name, unit, *values, verdict))
     return pd.DataFrame(rows, columns=list(DIFFERENCES))
 
@@ -169,16 +171,42 @@ def _notes(runs: Sequence[WholeRun], told: Sequence[ComparedRun]) -> Iterator[st
         if crashed:
             yield f"{one.label}: {crashed} crashed, counted as the worst there is; groups with them have no rates"
         first = runs[0].spec
-        if (theirs := _asked(first)) != (mine := _asked(run.spec)):
-            yield f"{told[0].label} was asked for {theirs}, {one.label} for {mine}"
+        if terms := _terms_apart(told[0], one):
+            yield (
+                f"No verdict of {one.label} against {told[0].label}: they drove by other terms, {terms}. "
+                "What differs is called neither better nor worse"
+            )
+        sees, saw = _eyes(one.table), _eyes(told[0].table)
+        if sees and saw and sees != saw:
+            yield f"{told[0].label} sees by {saw}; {one.label} by {sees}: a difference may be the camera's"
         if changed := [n for n, v in first.versions.items() if run.spec.versions.get(n) != v]:
             apart = ", ".join(f"{n} {first.versions[n]} and {run.spec.versions.get(n)}" for n in changed)
             yield f"{told[0].label} and {one.label} ran with other versions, a difference may be theirs: {apart}"
 
 
-def _asked(spec: RunSpec) -> str:
+def _terms_apart(before: ComparedRun, after: ComparedRun) -> str:
+    """The terms by which two runs did not drive alike, with those of each: what their policies were told, and when
+    their commands took effect; "" where there are none."""
+    one, other = _terms(before.table), _terms(after.table)
+    apart = [name for name in one if one[name] != other[name]]
+    return "; ".join(f"{name} {one[name]} ({before.label}) and {other[name]} ({after.label})" for name in apart)
+
+
+def _eyes(table: pd.DataFrame) -> str:
+    """By what a run's policy saw; "" for a blind one."""
+    camera, rate_hz = table[["camera", "rate_hz"]].iloc[0]
+    return "" if camera == "none" else f"{camera}, at {rate_hz:g} Hz"
+
+
+def _terms(table: pd.DataFrame) -> dict[str, str]:
     """What makes a run harder or easier, whatever its policy is."""
-    return f"goal {spec.goal_protocol}, {'real time' if spec.real_time else f'latency {spec.latency_ms:g} ms'}"
+    first = table.iloc[0]
+    return {
+        "goal": first["goal_protocol"],
+        "odometry": first["odometry"],
+        "knowledge": "privileged" if first["privileged"] else "of its own sensors",
+        "latency": "real time" if first["real_time"] else f"{first['latency_ms']:g} ms",
+    }
 
 
 def _lonely(pairs: Sequence[tuple[ComparedRun, ComparedRun]]) -> Iterator[str]:

@@ -87,6 +87,7 @@ def how_to_read(told: RunComparison) -> str:
         f"Paired by scenario, rates pooled; intervals by drawing scenarios again in pairs, {BOOTSTRAP} times, always "
         "the same. Within noise: the interval holds 0. Too few: it does not, but fewer than "
         f"{FEWEST_CHANGED} scenarios changed (of a rate: of those with a failure). "
+        "Differs: it does not, and there is no verdict. "
         f"One interval in twenty misses by chance alone: {shown} stand in these tables, {in_all} in a .csv, a row for "
         f"every metric of every group. SR {SUCCESS_IN_WORDS}; RC share of the route done; FC failures per 100 m "
         "travelled; the scenarios of an event are those that have one on their way."

@@ -7,7 +7,6 @@ import io
 import json
 import os
 import re
-import shutil
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing
@@ -19,6 +18,7 @@ import pytest
 from rich.console import Console
 
 from cosim.cli.results.compare import print_comparison
+from cosim.episode.ports import CameraSpec
 from cosim.judge.metrics import METRICS
 from cosim.records.comparison import (
     ComparedRun,
@@ -28,10 +28,11 @@ from cosim.records.comparison import (
     flipped_between,
     groups_of,
 )
-from cosim.records.run_folder import RunFolder, read_spec
+from cosim.records.record import Record
+from cosim.records.run_folder import RunFolder, read_records, read_spec
 from cosim.report.compared import as_latex, as_markdown, flips_in_words, tables_of_comparison
 from cosim.spec.events import Event
-from cosim.spec.scenario import Scenario
+from cosim.spec.scenario import Scenario, read_suite
 from tests.conftest import Cosim
 from tests.records.driven_runs import HIT, run_of, short_way
 
@@ -103,6 +104,48 @@ def test_a_run_is_compared_scenario_by_scenario(runs: Path) -> None:
     ]
 
 
+def test_runs_by_other_terms_are_called_neither_better_nor_worse(runs: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """Another goal protocol, odometry, knowledge or latency is named, and no verdict given; the differences stay."""
+    run = rewritten(
+        runs / "b", tmp_path / "b", goal_protocol="route_point", odometry="exact", privileged=True, latency_ms=200.0
+    )
+    told = compare_runs([runs / "a", run])
+    assert {*told.differences["verdict"]} <= {"within noise", "too few", "differs", ""}
+    assert row(told, "success")["verdict"] == "differs" and row(told, "success")["low"] > 0.0
+    (note,) = told.notes
+    assert note == (
+        "No verdict of b against a: they drove by other terms, goal none (a) and route_point (b); odometry none (a) "
+        "and exact (b); knowledge of its own sensors (a) and privileged (b); latency 0 ms (a) and 200 ms (b). What "
+        "differs is called neither better nor worse"
+    )
+    said = cosim("compare", str(runs / "a"), str(run))
+    assert said.returncode == 0 and note in said.stdout
+    assert re.search(r"success +0\.50 +0\.90 +\+0\.400 .* 20 differs", said.stdout)
+
+
+def test_another_camera_is_told_and_the_verdict_stays(runs: Path, tmp_path: Path) -> None:
+    """A camera is the policy's own choice; a run without one is a blind baseline, of which nothing is said."""
+    small, large = (
+        rewritten(runs / name, tmp_path / name, camera=msgspec.to_builtins(CameraSpec(width, 48)))
+        for name, width in (("a", 64), ("b", 96))
+    )
+    told = compare_runs([small, large])
+    assert row(told, "success")["verdict"] == "better"
+    a, b = (f"front, {width} x 48 px, 75 deg, at 4 Hz" for width in (64, 96))
+    assert f"a sees by {a}; b by {b}: a difference may be the camera's" in told.notes
+    assert not any("sees by" in note for note in compare_runs([runs / "a", large]).notes)
+
+
+def rewritten(run: Path, target: Path, **fields: object) -> Path:
+    """A copy of a run whose records have other fields."""
+    with RunFolder.create(target, read_spec(run), read_suite(run / "scenarios.json")) as folder:
+        for record in read_records(run):
+            told = msgspec.json.decode(msgspec.json.encode(msgspec.to_builtins(record) | fields), type=Record)
+            folder.keep(told, (run / f"episodes/{record.scenario}/trajectory.npz").read_bytes())
+        folder.finish()
+    return target
+
+
 def test_intervals_are_counted_where_they_stand(runs: Path) -> None:
     """Who reads the tables is told how many intervals are in them, and how many more are in the .csv of all metrics."""
     told = compare_runs([runs / "a", runs / "b", runs / "c"])
@@ -123,16 +166,6 @@ def test_a_run_is_within_noise_of_itself(runs: Path, cosim: Cosim) -> None:
     said = cosim("compare", str(runs / "a"), str(runs / "a"))
     assert said.returncode == 0 and "better" not in said.stdout and "worse" not in said.stdout
     assert "solved by a (2) alone, 0: none" in said.stdout
-
-
-def test_runs_of_other_latency_or_goal_are_told(runs: Path, tmp_path: Path) -> None:
-    """Both stand in a note, of the run that was asked for others."""
-    late = tmp_path / "late"
-    shutil.copytree(runs / "b", late)
-    spec = msgspec.structs.replace(read_spec(late), latency_ms=200.0, goal_protocol="route_point")
-    (late / "run.json").write_bytes(msgspec.json.encode(spec))
-    told = compare_runs([runs / "a", late])
-    assert told.notes == ("a was asked for goal none, latency 0 ms, b for goal route_point, latency 200 ms",)
 
 
 def test_who_crashes_is_compared_at_its_worst_and_has_no_rates(runs: Path) -> None:
