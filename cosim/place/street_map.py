@@ -6,10 +6,11 @@ and the referee's walkable area derive from it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Literal, NamedTuple, Self
+from typing import Final, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 import shapely
@@ -118,16 +119,19 @@ class Junction:
     signalised: bool
 
 
-FeatureKind = Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"]
+LandKind = Literal["lawn", "planting", "soil", "yard", "water"]
+"""What open land is covered with. yard: land to park, drive or work on, such as a parking lot."""
+LANDS: Final[tuple[LandKind, ...]] = get_args(LandKind)
+FeatureKind = Literal["building", "tree", "lamp", "bench", "bollard", "bin", "hydrant", "rack"] | LandKind
 
 
 @dataclass(frozen=True, slots=True)
 class Feature:
-    """A building or a thing on the street that the map itself shows.
+    """A building, a thing on the street or a piece of land that the map itself shows.
 
     x_m, y_m: its middle. heading_rad: along it, what it serves or faces to its left (the arm of a lamp) or right (who
-    sits on a bench, the front of a building). height_m: 0 where the map does not say. polygon: a building's ground;
-    empty for the others.
+    sits on a bench, the front of a building). height_m: 0 where the map does not say. polygon: the ground of a building
+    or a piece of land; empty for the others.
     """
 
     kind: FeatureKind
@@ -156,6 +160,7 @@ class StreetMap:
     bounds: x0, y0, x1, y1 in metres. net_hash: content hash of the net it was read from, and of the features where
     there are any. features: what the map shows beside its streets; none of it stands in the way.
     terrain: None where the place is flat; elevation: what became of the net's elevations, None when it has none.
+    planned: a generated city: its net names the class of each of its streets.
     """
 
     name: str
@@ -169,6 +174,7 @@ class StreetMap:
     features: tuple[Feature, ...] = ()
     terrain: Terrain | None = None
     elevation: Elevation | None = None
+    planned: bool = False
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
         default_factory=dict, repr=False, compare=False
     )
@@ -205,6 +211,24 @@ class StreetMap:
         """Pieces of `kind` whose polygon touches `area`, in the net's order."""
         tree, pieces = self._tree(kind)
         return [pieces[i] for i in np.sort(tree.query(area, predicate="intersects"))]
+
+    def lands_near(self, area: shapely.Geometry) -> list[Feature]:
+        """Pieces of land that the map shows and that touch `area`, the smallest first."""
+        tree, lands = self._lands
+        return sorted((lands[i] for i in np.sort(tree.query(area, "intersects"))), key=lambda land: land.polygon.area)
+
+    def houses_near(self, area: shapely.Geometry) -> list[Feature]:
+        """Buildings that the map shows and that touch `area`, in its order."""
+        tree, houses = self._houses
+        return [houses[i] for i in np.sort(tree.query(area, "intersects"))]
+
+    @cached_property
+    def _lands(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
+        return _by_place(feature for feature in self.features if feature.kind in LANDS)
+
+    @cached_property
+    def _houses(self) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
+        return _by_place(feature for feature in self.features if feature.kind == "building")
 
     def walkable_near(self, area: shapely.Geometry) -> Polygon | MultiPolygon:
         """Union of the walkable pieces that touch `area`; seams closed. Raises MapError when there are none."""
@@ -249,6 +273,16 @@ class StreetMap:
             pieces = of_kind[kind]
             self._trees[kind] = (shapely.STRtree([p.polygon for p in pieces]), pieces)
         return self._trees[kind]
+
+
+def _by_place(features: Iterable[Feature]) -> tuple[shapely.STRtree, tuple[Feature, ...]]:
+    held = tuple(features)
+    return shapely.STRtree([feature.polygon for feature in held]), held
+
+
+def street_of(edge: str) -> str:
+    """What the two directions and the pieces of a street have in common: `-s12b` and `s12a` are s12, `-7#2` is 7."""
+    return re.sub(r"(#-?\d+|(?<=\d)[a-d])$", "", edge.removeprefix("-"))
 
 
 def union_closed(polygons: Sequence[shapely.Geometry]) -> Polygon | MultiPolygon:

@@ -16,6 +16,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon
 from cosim.core.geometry import Floats
 from cosim.core.state import DIRECTED, PersonKind
 from cosim.episode.log import Log
+from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND, open_ground
 from cosim.place.street_map import Lane, StreetMap
 from cosim.records.record import Record
 from cosim.report.legend import Image, Rgb255, legend, wide_px
@@ -35,12 +36,13 @@ FAILURE_RING_M: Final = 0.6
 END_M: Final = 0.6
 """Radius of the dots at start and goal."""
 
-GROUND_COLOUR: Final[Rgb255] = (214, 226, 214)
+GROUND_COLOUR: Final[Rgb255] = GROUND_LOOKS[PLAIN_GROUND].drawn
 ROAD: Final[Rgb255] = (120, 120, 124)
 VERGE: Final[Rgb255] = (150, 200, 150)
 _WALK: Final[Rgb255] = (238, 236, 230)
 _CROSSING: Final[Rgb255] = (250, 250, 190)
-_GROUNDS: Final = {"road": ROAD, "verge": VERGE, "walk": _WALK, "crossing": _CROSSING}
+_STREETS: Final = {"road": ROAD, "verge": VERGE, "walk": _WALK, "crossing": _CROSSING}
+_GROUNDS: Final[dict[str, Rgb255]] = {**{kind: look.drawn for kind, look in GROUND_LOOKS.items()}, **_STREETS}
 ROUTE: Final[Rgb255] = (60, 120, 220)
 TRACK: Final[Rgb255] = (20, 20, 20)
 BARRIER: Final[Rgb255] = (210, 30, 30)
@@ -165,7 +167,9 @@ def draw_streets(sheet: Sheet, street_map: StreetMap, area: Polygon) -> None:
 
 
 def street_areas(street_map: StreetMap, area: Polygon) -> Iterator[tuple[str, Polygon | MultiPolygon]]:
-    """What lies in a part of a map, in the order in which it is drawn: road, verge, walk or crossing, and its shape."""
+    """What lies in a part of a map, in the order in which it is drawn: what covers open ground (`GROUND_LOOKS`), road,
+    verge, walk or crossing, and its shape."""
+    yield from open_ground(street_map, area)
     lanes = [piece for piece in street_map.near("lane", area) if isinstance(piece, Lane)]
     for junction in street_map.near("junction", area):
         yield "road", junction.polygon

@@ -1,4 +1,4 @@
-"""What lies between sidewalks and houses: paved before shops, gardens before homes, and the ways of the driveways.
+"""What lies between sidewalks and houses in generated cities: paved before shops, gardens before homes, driveways.
 
 It is laid over the ground, a few millimetres thick: it changes colours, not labels or friction. Nobody walks there.
 """
@@ -13,25 +13,21 @@ from typing import Final, NamedTuple
 import numpy as np
 import shapely
 
-from cosim.core.geometry import Floats, Polyline
-from cosim.place.street_map import StreetMap, Strip
-from physics.street.mapped import MappedThings
+from cosim.core.geometry import Polyline
+from cosim.place.open_ground import beside
+from cosim.place.street_map import StreetMap, Strip, street_of
+from physics.street.covers import laid_over
 from physics.street.placement import street_style
 from physics.textures.layers import Colour
-from physics.world.materials import street_of
-from physics.world.mesh import Mesh, join, plan_triangles, quads
+from physics.world.mesh import Mesh
 from physics.world.tiles import DRIVEWAY_M, Tile, square
 
-_LIFT_M: Final = 0.003
-_GRID_M: Final = 1e-4
-"""Ends of edges nearer to one another than about this are the same."""
 _REACH_M: Final = 12.0
 _UNDER_M: Final = 0.6
 """So far it reaches under the houses, whose fronts are straight where a street bends."""
 _DEEPEST_M: Final = 6.0
 _YARD_M: Final = 3.0
 """Depth of the paved yards between the houses of a street that is paved."""
-_NEAR_M: Final = 4.0
 _BED_M: Final = (0.45, 0.8)
 """Width of the beds at the feet of houses with gardens."""
 
@@ -56,8 +52,6 @@ _COVERS: Final[Mapping[str, tuple[Cover, ...]]] = {
     "ring": (Cover("slabs-square", _SLABS), Cover("concrete-cast", None)),
 }  # fmt: skip
 """What the frontage of a class of streets may be paved with; other classes have gardens."""
-_TOWN: Final = (Cover("slabs-worn", None), Cover("setts", None), Cover("slabs-square", _SLABS))
-"""What lies between sidewalks and the houses of a map that stand near them."""
 _WAYS: Final = (Cover("concrete-cast", None), Cover("pavers-herringbone", (0.56, 0.52, 0.49)), Cover("gravel", None))
 _BEDS: Final = Cover("earth", None)
 
@@ -69,26 +63,24 @@ class Laid(NamedTuple):
     cover: Cover
 
 
-def frontage_in(street_map: StreetMap, tile: Tile, seed: int, mapped: MappedThings | None = None) -> list[Laid]:
-    """What lies on the open ground of a tile, a few millimetres above it. mapped: shows houses of the map itself."""
-    if "ground" not in tile.parts:
+def frontage_in(street_map: StreetMap, tile: Tile, seed: int) -> list[Laid]:
+    """What lies on the open ground of a tile of a generated city, a few millimetres above it; nothing on other maps."""
+    if not street_map.planned or "ground" not in tile.parts:
         return []
     x0, y0, x1, y1 = square(tile.key)
     reach = shapely.box(x0 - _REACH_M, y0 - _REACH_M, x1 + _REACH_M, y1 + _REACH_M)
     strips = [s for s in street_map.near("strip", reach) if isinstance(s, Strip)]
-    houses = shapely.buffer(shapely.union_all([] if mapped is None else mapped.houses(reach)), _NEAR_M, quad_segs=2)
-    shapely.prepare(houses)
     areas: dict[Cover, list[shapely.Geometry]] = {}
     for strip in strips:
         if strip.kind == "sidewalk":
-            for cover, area in _of(strip, seed, houses):
+            for cover, area in _of(strip, seed):
                 areas.setdefault(cover, []).append(area)
     triangles = tile.parts["ground"]
     found: list[Laid] = []
     taken: shapely.Geometry = shapely.Polygon()
     for cover in sorted(areas, key=lambda cover: (cover not in _WAYS, cover.layer, cover.colour or ())):
         area = shapely.union_all(areas[cover])
-        found.append(Laid(_edged(_clipped(triangles, shapely.difference(area, taken))), cover))
+        found.append(Laid(laid_over(triangles, shapely.difference(area, taken)), cover))
         taken = shapely.union(taken, area)
     return [laid for laid in found if len(laid.mesh)]
 
@@ -98,25 +90,21 @@ def paved(strip: Strip) -> bool:
     return street_style(strip.street_class) in _COVERS
 
 
-def _of(strip: Strip, seed: int, houses: shapely.Geometry) -> list[tuple[Cover, shapely.Geometry]]:
-    """The frontage of a sidewalk and its driveways. houses: the ground near houses of the map."""
+def _of(strip: Strip, seed: int) -> list[tuple[Cover, shapely.Geometry]]:
+    """The frontage of a sidewalk and its driveways."""
     rng = np.random.default_rng([seed, zlib.crc32(strip.id.encode()), 0xF207])
-    line, edge, depth = _line(strip), 0.5 * strip.width_m, min(strip.frontage_m, _DEEPEST_M)
+    edge, depth = 0.5 * strip.width_m, min(strip.frontage_m, _DEEPEST_M)
     covers = _COVERS.get(street_style(strip.street_class))
     of_street = np.random.default_rng([seed, zlib.crc32(street_of(strip.id).encode()), 0xF207])
     found: list[tuple[Cover, shapely.Geometry]] = []
-    if shapely.intersects(houses, line):
-        cover = _TOWN[int(of_street.integers(len(_TOWN)))]
-        around = shapely.buffer(line, edge + _NEAR_M, cap_style="flat", join_style="mitre")
-        found.append((cover, shapely.intersection(around, houses)))
-    elif strip.road_side == 0 or depth <= 0.0:
+    if strip.road_side == 0 or depth <= 0.0:
         return found
-    elif covers is not None:
+    if covers is not None:
         cover = covers[int(of_street.integers(len(covers)))]
-        found.append((cover, _beside(line, edge - 0.05, edge + depth + _YARD_M)))
-    elif strip.street_class == "residential" and rng.random() < 0.6:  # on other maps there may be no house
+        found.append((cover, beside(strip, edge - 0.05, edge + depth + _YARD_M)))
+    elif strip.street_class == "residential" and rng.random() < 0.6:
         width = float(rng.uniform(*_BED_M))
-        found.append((_BEDS, _beside(line, edge + depth - width, edge + depth + _UNDER_M)))
+        found.append((_BEDS, beside(strip, edge + depth - width, edge + depth + _UNDER_M)))
     way = _WAYS[int(of_street.integers(len(_WAYS)))]
     middle = Polyline(strip.line)
     for at_m in strip.driveways:
@@ -126,63 +114,3 @@ def _of(strip: Strip, seed: int, houses: shapely.Geometry) -> list[tuple[Cover, 
         near, far = (np.array([x, y]) + d * aside for d in (edge - 0.05, edge + depth + _YARD_M))
         found.append((way, shapely.Polygon([near - along, near + along, far + along, far - along])))
     return found
-
-
-def _line(strip: Strip) -> shapely.LineString:
-    """The middle of a sidewalk with the houses to its left."""
-    return shapely.LineString((strip.line if strip.road_side < 0 else strip.line[::-1])[:, :2])
-
-
-def _beside(line: shapely.LineString, near_m: float, far_m: float) -> shapely.Geometry:
-    """What lies between two distances to the left of a line."""
-    one, two = (
-        shapely.buffer(line, d, cap_style="flat", join_style="mitre", single_sided=True) for d in (far_m, near_m)
-    )
-    return shapely.difference(one, two)
-
-
-def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
-    """The parts of a mesh's triangles that lie in an area, lifted a little."""
-    shapely.prepare(area)
-    corners = mesh.vertices[mesh.triangles]
-    outlines = np.asarray(shapely.polygons(corners[:, :, :2]), dtype=object)
-    met = np.flatnonzero(shapely.intersects(area, outlines))
-    whole = shapely.contains_properly(area, outlines[met])
-    kept = met[whole]
-    used, index = np.unique(mesh.triangles[kept], return_inverse=True)
-    lifted = mesh.vertices[used] + np.array([0.0, 0.0, _LIFT_M])
-    found = [Mesh(lifted, mesh.normals[used], index.reshape(-1, 3).astype(np.int32))]
-    for i in met[~whole].tolist():
-        part = shapely.intersection(outlines[i], area)
-        if shapely.area(part) > 1e-4:
-            found.append(_cut(part, corners[i], mesh.normals[mesh.triangles[i]]))
-    return join(found)
-
-
-def _edged(mesh: Mesh) -> Mesh:
-    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look under it."""
-    if not len(mesh):
-        return mesh
-    corners = mesh.vertices[mesh.triangles]
-    ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    grid = np.rint(ends[:, :, :2] / _GRID_M).astype(np.int64)
-    one, two = (np.ascontiguousarray(grid[:, i]).view("i8,i8").ravel() for i in (0, 1))
-    order = {(a, b): k for k, (a, b) in enumerate(zip(one.tolist(), two.tolist(), strict=True))}
-    alone = ends[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
-    if not len(alone):
-        return mesh
-    under = alone - np.array([0.0, 0.0, _LIFT_M])
-    rim = quads(np.stack([under[:, 0], under[:, 1], alone[:, 1], alone[:, 0]], axis=1))
-    lit = np.tile([0.0, 0.0, 1.0], (len(rim.vertices), 1))  # like the surface: a millimetre's wall would be a dark line
-    return join([mesh, Mesh(rim.vertices, lit, rim.triangles)])
-
-
-def _cut(part: shapely.Geometry, corners: Floats, normals: Floats) -> Mesh:
-    """A part of a triangle, (3, 3) corners and normals, as triangles in its plane."""
-    pieces = [p for p in shapely.get_parts(part) if shapely.get_dimensions(p) == 2]
-    at = plan_triangles(pieces)[0].reshape(-1, 2)
-    shares = np.column_stack([at, np.ones(len(at))]) @ np.linalg.inv(np.column_stack([corners[:, :2], np.ones(3)]))
-    z = shares @ corners[:, 2] + _LIFT_M
-    slopes = shares @ normals
-    slopes /= np.linalg.norm(slopes, axis=1, keepdims=True)
-    return Mesh(np.column_stack([at, z]), slopes, np.arange(len(at), dtype=np.int32).reshape(-1, 3))

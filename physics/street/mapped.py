@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.place import overlay
-from cosim.place.street_map import Feature, StreetMap
+from cosim.place.street_map import LANDS, Feature, StreetMap
 from cosim.place.terrain import Terrain
 from physics.street.buildings import FACADES, Building, Wall
 from physics.street.furniture import KINDS, PROP_VARIANTS, Prop
@@ -29,12 +29,14 @@ _SPLINTER_M2: Final = 0.05
 
 
 class MappedThings:
-    """The features of a street map for the engines; a pure function of the map. kinds: of the things it shows."""
+    """The buildings and things that a street map shows, for the engines; a pure function of the map. kinds: of the
+    things."""
 
     def __init__(self, street_map: StreetMap) -> None:
         by_kind: dict[str, list[Feature]] = defaultdict(list)
         for feature in street_map.features:
-            by_kind[feature.kind].append(feature)
+            if feature.kind not in LANDS:
+                by_kind[feature.kind].append(feature)
         self._houses = by_kind.pop("building", [])
         self._floors_m = [_floor_m(house.polygon, street_map.terrain) for house in self._houses]
         self._house_tree = shapely.STRtree([house.polygon for house in self._houses])
@@ -44,7 +46,7 @@ class MappedThings:
         self._trees["building"] = self._house_tree
         self.kinds = frozenset(by_kind)
         self._props: dict[Key, list[Prop]] = defaultdict(list)
-        for i, feature in enumerate(f for f in street_map.features if f.kind != "building"):
+        for i, feature in enumerate(f for f in street_map.features if f.kind not in ("building", *LANDS)):
             self._props[key_at(feature.x_m, feature.y_m)].append(_prop(i, feature))
 
     @property
@@ -65,10 +67,6 @@ class MappedThings:
             solid = [p for p in parts if isinstance(p, Polygon) and p.area > _SPLINTER_M2]
             found += [_building(i, self._houses[i], part, self._floors_m[i]) for part in solid]
         return tuple(found)
-
-    def houses(self, area: shapely.Geometry) -> list[Polygon]:
-        """Outlines of the buildings that touch an area."""
-        return [self._houses[i].polygon for i in np.sort(self._house_tree.query(area, predicate="intersects")).tolist()]
 
     def shows(self, kind: str, place: shapely.Geometry) -> bool:
         """Whether the map shows things of a kind near a place, so that none need be made up there."""

@@ -123,6 +123,21 @@ def _grass(dry: float, worn: float = 0.0) -> Generator:
     return make
 
 
+def _planting(noise: Noise) -> Picture:
+    """Low shrubs: leaves of some centimetres, dark between them."""
+    leaves = cells(noise, 40, 0.9)
+    tone = noise.rng.normal(1.0, 0.18, (leaves.n, 1)).astype(np.float32)
+    palette = np.asarray(((0.24, 0.35, 0.16), (0.20, 0.30, 0.13), (0.27, 0.36, 0.19)), dtype=np.float32)
+    green = palette[noise.rng.integers(len(palette), size=leaves.n)] * tone
+    rgb = mixed((0.08, 0.12, 0.06), green[leaves.id], step(0.0, 0.006, leaves.edge))
+    return Picture(shaded(rgb, 1.0 + 0.10 * noise.clouds(8) + 0.10 * noise.clouds(64)))
+
+
+def _water(noise: Noise) -> Picture:
+    ripples = noise.warped(noise.streaks(32, 8), 0.05, 8)
+    return Picture(shaded(plain(noise, (0.16, 0.28, 0.36), 0.01, 0.0), 1.0 + 0.06 * ripples))
+
+
 def _earth(noise: Noise) -> Picture:
     rgb = stained(plain(noise, (0.43, 0.36, 0.28), 0.03, 0.03, 8), noise, 0.15, 8)
     pebbles = cells(noise, 40, 0.9)
@@ -213,6 +228,9 @@ GROUND_RECIPES: Final[Mapping[str, Recipe]] = {
     "grass-worn": Recipe(2.0, _grass(0.5, 0.9)),
     "earth": Recipe(2.0, _earth),
     "gravel": Recipe(1.2, _gravel),
+    "planting": Recipe(1.6, _planting),
+    "water": Recipe(6.0, _water),
+    "asphalt-footway": Recipe(2.0, _asphalt(0.035, 0.55)),
     "tactile-domes": Recipe(0.6, _tactile(bars=False)),
     "tactile-bars": Recipe(0.6, _tactile(bars=True)),
     "paint": Recipe(2.0, _paint(0.35)),
@@ -241,8 +259,14 @@ SURFACE_LAYERS: Final[Mapping[str, tuple[str, ...]]] = {
     "grass": ("grass", "grass-dry", "grass-worn"),
     "gravel": ("gravel",),
     "earth": ("earth", "gravel"),
+    "footway": ("asphalt-footway",),
+    "planting": ("planting",),
+    "soil": ("earth",),
+    "yard": ("asphalt-worn",),
+    "water": ("water",),
 }
-"""Layers that a kind of ground (physics.world.tiles) or a material (physics.world.materials) may show."""
+"""Layers that a kind of ground (physics.world.tiles), a material (physics.world.materials) or a look of open ground
+(cosim.place.open_ground) may show."""
 
 
 def layer_of(surface: str, seed: int = 0) -> str:

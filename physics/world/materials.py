@@ -6,7 +6,6 @@ that streets meet on neutral ground.
 
 from __future__ import annotations
 
-import re
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +16,8 @@ import shapely
 from numpy.typing import NDArray
 
 from cosim.core.geometry import Floats
-from cosim.place.street_map import Lane, StreetMap, Strip
+from cosim.place.open_ground import GROUND_LOOKS, PLAIN_GROUND
+from cosim.place.street_map import Lane, StreetMap, Strip, street_of
 from physics.textures.layers import Colour
 
 PLAIN_FRICTION: Final = 0.9
@@ -70,17 +70,20 @@ PAVINGS: Final[Mapping[str, Colour]] = {
 }
 """Colours of paved surfaces. A surface is called by its kind, its material and the number of its colour."""
 
+SEEN_AS: Final[Mapping[str, tuple[str, Colour]]] = {
+    "ground": ("ground", GROUND_LOOKS[PLAIN_GROUND].seen),
+    "sidewalk:asphalt:0": ("sidewalk:footway:0", (0.57, 0.55, 0.52)),
+    "sidewalk:asphalt:1": ("sidewalk:footway:1", (0.62, 0.60, 0.58)),
+}
+"""What surfaces look like where that is not their own look, on every map but generated cities: nothing that is walked
+on resembles a carriageway or open ground, so the asphalt of a footway is light."""
+
 
 def friction(surface: str) -> float:
     """Friction of a surface, by its name."""
     kind, _, rest = surface.partition(":")
     name = rest.partition(":")[0] if rest else _OF_KIND.get(kind, "")
     return MATERIALS[name].friction if name else PLAIN_FRICTION
-
-
-def street_of(edge: str) -> str:
-    """What the two directions and the pieces of a street have in common: `-s12b` and `s12a` are s12, `-7#2` is 7."""
-    return re.sub(r"(#-?\d+|(?<=\d)[a-d])$", "", edge.removeprefix("-"))
 
 
 class Paving:

@@ -14,8 +14,10 @@ from numpy.typing import ArrayLike
 from cosim.core.baked import Arrays
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
+from cosim.place.open_ground import GROUND_LOOKS
 from cosim.place.street_map import StreetMap
 from physics.street.buildings import Building, Frontage, on_land
+from physics.street.covers import covers_in
 from physics.street.frontage import frontage_in
 from physics.street.fronts import style_of
 from physics.street.furniture import Prop
@@ -32,7 +34,8 @@ from physics.world.kept_tiles import (
     tile_as_arrays,
     tile_of_arrays,
 )
-from physics.world.materials import PAVINGS, PLAIN_FRICTION, Paving, friction
+from physics.world.materials import PAVINGS, PLAIN_FRICTION, SEEN_AS, Paving, friction
+from physics.world.mesh import Mesh
 from physics.world.surface import Chunk, Finish, Patch, Surface
 from physics.world.tiles import Key, Tile, build_tile, cells_of, keys_in, surface
 
@@ -52,7 +55,7 @@ class StreetSurface(Surface):
         self.seed = seed
         self.roughness = roughness
         self.level = street_map.terrain is None
-        self._mapped = mapped = MappedThings(street_map)
+        mapped = MappedThings(street_map)
         self._frontage = Frontage(street_map, seed, mapped)
         self._paving = Paving(street_map, seed)
         self._placement = Placement(street_map, seed, self._frontage, mapped)
@@ -61,18 +64,27 @@ class StreetSurface(Surface):
         self._things: dict[Key, TileThings] = {}
 
     def chunk(self, key: Key) -> Chunk:
-        ground = [
-            Patch(name, mesh, friction(name), *surface(name), layer_of(name, self.seed), name in PAVINGS)
-            for name, mesh in self.tile(key).parts.items()
-        ]
+        ground = [self._patch(name, mesh) for name, mesh in self.tile(key).parts.items()]
         return Chunk(tuple(ground), self.buildings(key), self.props(key))
+
+    def _patch(self, name: str, mesh: Mesh) -> Patch:
+        label, colour = surface(name)
+        shown, colour = (name, colour) if self.street_map.planned else SEEN_AS.get(name, (name, colour))
+        return Patch(name, mesh, friction(name), label, colour, layer_of(shown, self.seed), name in PAVINGS)
+
+    def covers(self, key: Key) -> tuple[Patch, ...]:
+        laid = []
+        for kind, mesh in covers_in(self.street_map, self.tile(key)):
+            name, colour = f"ground:{kind}", GROUND_LOOKS[kind].seen
+            laid.append(Patch(name, mesh, PLAIN_FRICTION, "ground", colour, layer_of(name, self.seed)))
+        return tuple(laid)
 
     def posts(self, key: Key) -> list[SignalPost]:
         return posts_in(self.street_map, key)
 
     def finish(self, key: Key) -> Finish:
         tile, laid, painted = self.tile(key), [], []
-        for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed, self._mapped):
+        for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
             tint = colour or (1.0, 1.0, 1.0)
             laid.append(Patch(f"ground:{layer}", mesh, PLAIN_FRICTION, "ground", tint, layer, colour is not None))
         for layer, mesh in paint_in(self.street_map, tile).items():

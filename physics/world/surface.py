@@ -82,6 +82,10 @@ class Surface(ABC):
         """The pedestrian signals in a square."""
         return []
 
+    def covers(self, key: Key) -> tuple[Patch, ...]:
+        """Thin covers on the ground of a square, shown by every camera, touched by nothing."""
+        return ()
+
     def finish(self, key: Key) -> Finish:
         """What cameras with textures add to the chunk of a square."""
         return Finish()

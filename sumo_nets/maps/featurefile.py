@@ -12,7 +12,7 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.core.errors import MapError
-from cosim.place.street_map import Feature, FeatureKind
+from cosim.place.street_map import LANDS, Feature, FeatureKind
 
 _SCHEMA = 1
 NAME = "features.json"
@@ -65,7 +65,7 @@ def _feature(row: _Row) -> Feature:
     numbers = (row.x_m, row.y_m, row.heading_rad, row.height_m)
     if not all(map(math.isfinite, numbers)) or row.height_m < 0.0:
         raise ValueError(f"a {row.kind} with numbers that cannot be: {numbers}")
-    if (row.kind == "building") != (not polygon.is_empty and polygon.is_valid):
+    if (row.kind in ("building", *LANDS)) != (not polygon.is_empty and polygon.is_valid):
         raise ValueError(f"a {row.kind} at ({row.x_m:g}, {row.y_m:g}) whose outline does not fit it")
     return Feature(row.kind, row.x_m, row.y_m, row.heading_rad, row.height_m, polygon)
 

@@ -18,7 +18,7 @@ from shapely.geometry import Point, Polygon
 
 from cosim.core.geometry import Floats
 from cosim.place import overlay
-from cosim.place.street_map import Feature, FeatureKind, Lane, StreetMap, Strip
+from cosim.place.street_map import LANDS, Feature, FeatureKind, LandKind, Lane, StreetMap, Strip
 from sumo_nets.maps.osmfeatures import Found, Mapped
 from sumo_nets.maps.utm import utm_xy, utm_zone
 
@@ -42,6 +42,8 @@ _FAR_M: Final = 100.0
 """What is farther from every walkway is left out."""
 IN_ZONE_DEG: Final = 10.0
 """What is farther from the middle of the net's UTM zone is no part of the map."""
+_LAND_M2: Final = 1.0
+"""Smaller pieces of land are left out."""
 LEFT_SHARE: Final = 0.5
 LEFT_M2: Final = 6.0
 """A building stays when this much of it is left after the streets have been cut out."""
@@ -63,14 +65,16 @@ def fitted(found: Found, location: Mapping[str, str], street_map: StreetMap) -> 
     near = _near(mapped, street_map)
     streets = _Streets(street_map)
     buildings, told = _cut_back([thing for thing in near if thing.kind == "building"], streets)
-    standing, more = _settled([thing for thing in near if thing.kind != "building"], streets, buildings)
-    kinds = Counter(feature.kind for feature in (*buildings, *standing))
+    things = [thing for thing in near if thing.kind not in ("building", *LANDS)]
+    standing, more = _settled(things, streets, buildings)
+    lands = _clipped([thing for thing in near if thing.kind in LANDS], street_map)
+    kinds = Counter(feature.kind for feature in (*buildings, *standing, *lands))
     words = [f"{count} x {kind}" for kind, count in kinds.items()]
     changes = [f"taken from the map: {', '.join(words)}"] if words else []
     left_out = [f"{count} x {reason}" for reason, count in found.skipped.items()]
     if left_out:
         changes.append(f"left out: {', '.join(left_out)}")
-    return (*buildings, *standing), [*changes, *told, *more]
+    return (*buildings, *standing, *lands), [*changes, *told, *more]
 
 
 def _in_zone(thing: Mapped, zone: int) -> bool:
@@ -83,9 +87,32 @@ def _near(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Mapped]:
     walked = [strip.polygon for strip in street_map.strips.values()]
     if not walked or not mapped:
         return []
-    outlines = [shapely.LineString(t.rings[0]) if len(t.rings[0]) > 1 else Point(t.rings[0][0]) for t in mapped]
+    outlines = [_outline(thing) for thing in mapped]
     hit, _ = shapely.STRtree(walked).query(outlines, predicate="dwithin", distance=_FAR_M)
     return [mapped[i] for i in np.unique(hit)]
+
+
+def _outline(thing: Mapped) -> shapely.Geometry:
+    """What a thing covers, near enough to say whether a walkway is near. Walkways lead through land, not houses."""
+    ring = thing.rings[0]
+    if thing.kind in LANDS:
+        return shapely.make_valid(Polygon(ring))
+    return shapely.LineString(ring) if len(ring) > 1 else Point(ring[0])
+
+
+def _clipped(mapped: Sequence[Mapped], street_map: StreetMap) -> list[Feature]:
+    """Pieces of land within the map, to the decimetre."""
+    x0, y0, x1, y1 = street_map.bounds
+    area = shapely.box(x0 - _FAR_M, y0 - _FAR_M, x1 + _FAR_M, y1 + _FAR_M)
+    found: list[Feature] = []
+    for thing in mapped:
+        whole = shapely.make_valid(Polygon(thing.rings[0], thing.rings[1:]))
+        inside = shapely.set_precision(shapely.simplify(overlay.intersection(whole, area), 0.1), 0.01)
+        for part in shapely.get_parts(inside):
+            if isinstance(part, Polygon) and part.is_valid and part.area > _LAND_M2:
+                x, y = shapely.get_coordinates(shapely.point_on_surface(part))[0].tolist()
+                found.append(Feature(cast(LandKind, thing.kind), round(x, 2), round(y, 2), polygon=part))
+    return found
 
 
 class _Streets:

@@ -1,4 +1,4 @@
-"""What OpenStreetMap shows beside its streets: buildings, trees, lamps, benches and the like, in degrees as mapped.
+"""What OpenStreetMap shows beside its streets: buildings, trees, lamps, land and the like, in degrees as mapped.
 
 Nothing here raises for what mappers got wrong: what cannot be understood is left out and counted.
 """
@@ -17,6 +17,7 @@ import shapely
 from shapely.geometry import Polygon
 
 from cosim.core.geometry import Floats
+from cosim.place.street_map import LandKind
 from sumo_nets.maps.osmfile import MapFile, scanned
 
 _STOREY_M = 3.2
@@ -49,15 +50,51 @@ _LEVELS = 3.0
 """Storeys of a building of which nothing is said."""
 SMALL_M2 = 40.0
 """Less than this on the ground has one storey: kiosks, sheds, advertising columns."""
+LARGEST_LAND_DEG2 = 1e-2
+"""About 100 km2."""
+_GREEN = ("grass", "meadow", "recreation_ground", "village_green", "cemetery", "allotments", "orchard", "vineyard")
+_SPORT = ("park", "garden", "pitch", "golf_course", "dog_park", "common", "nature_reserve")
+_OPEN: Mapping[LandKind, Mapping[str, tuple[str, ...]]] = {
+    "lawn": {
+        "landuse": (*_GREEN, "farmland", "greenfield", "plant_nursery", "greenery"),
+        "leisure": _SPORT,
+        "natural": ("grassland", "heath"),
+        "amenity": ("grave_yard",),
+    },
+    "planting": {"landuse": ("forest", "flowerbed"), "natural": ("wood", "scrub", "shrubbery")},
+    "soil": {
+        "landuse": ("construction", "brownfield", "quarry", "landfill"),
+        "natural": ("sand", "beach", "bare_rock", "shingle", "scree", "mud"),
+        "leisure": ("playground",),
+    },
+    "yard": {
+        "amenity": ("parking", "fuel", "bus_station", "car_wash", "marketplace"),
+        "landuse": ("industrial", "commercial", "retail", "depot", "garages", "port", "railway"),
+        "place": ("square",),
+        "highway": ("pedestrian", "services"),
+    },
+    "water": {
+        "natural": ("water", "bay"),
+        "landuse": ("basin", "reservoir"),
+        "waterway": ("riverbank", "dock"),
+        "leisure": ("swimming_pool", "marina"),
+    },
+}
+LAND_OF: Mapping[tuple[str, str], LandKind] = {
+    (key, value): kind for kind, keys in _OPEN.items() for key, values in keys.items() for value in values
+}
+"""What covers a piece of land, by its tag. Squares of people on which the net does not let walk are yards too."""
+_ROOFED = ("underground", "multi-storey", "rooftop", "carports", "garage_boxes", "sheds")
+"""Values of parking=* that are no open land."""
 METRE_DEG = 1.0 / 111_195.0
 _NUMBER = re.compile(r"\d{1,6}(?:\.\d{1,6})?")
 WINDS = ("N", "NNE", "NE", "ENE", "E", "ESE", "SE", "SSE", "S", "SSW", "SW", "WSW", "W", "WNW", "NW", "NNW")
 
 
 class Mapped(NamedTuple):
-    """A thing as mapped. rings: (N, 2) longitudes and latitudes: of a building its outline and its courtyards, of the
-    others one point. height_m: 0 when nothing usable is said. facing_rad: the way one looks who sits on it, None when
-    nothing is said."""
+    """A thing as mapped. rings: (N, 2) longitudes and latitudes: of buildings and land the outline and its holes, of
+    the others one point. height_m: 0 when nothing usable is said. facing_rad: the way one looks who sits on it, None
+    when nothing is said."""
 
     kind: str
     rings: tuple[Floats, ...]
@@ -75,12 +112,14 @@ class Found:
 
 @dataclass(slots=True)
 class _Scan:
-    """One pass over a file. spots: tagged nodes; ways: node ids and tags; areas: multipolygons with building tags."""
+    """One pass over a file. spots: tagged nodes; ways: node ids and tags; areas, lands: multipolygons with tags of
+    buildings, and of land."""
 
     lonlat: dict[str, tuple[float, float]] = field(default_factory=dict)
     spots: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     ways: dict[str, tuple[list[str], dict[str, str]]] = field(default_factory=dict)
     areas: list[tuple[list[tuple[str, str]], dict[str, str]]] = field(default_factory=list)
+    lands: list[tuple[list[tuple[str, str]], dict[str, str]]] = field(default_factory=list)
     tags: dict[str, str] = field(default_factory=dict)
     refs: list[str] = field(default_factory=list)
     members: list[tuple[str, str]] = field(default_factory=list)
@@ -105,8 +144,11 @@ class _Scan:
             self.spots.append((self.name, self.tags))
         elif tag == "way":
             self.ways[self.name] = self.refs, self.tags
-        elif tag == "relation" and self.tags.get("type") == "multipolygon" and "building" in self.tags:
-            self.areas.append((self.members, self.tags))
+        elif tag == "relation" and self.tags.get("type") == "multipolygon":
+            if "building" in self.tags:
+                self.areas.append((self.members, self.tags))
+            elif _land(self.tags) is not None:
+                self.lands.append((self.members, self.tags))
 
 
 def osm_features(file: MapFile) -> Found:
@@ -114,7 +156,7 @@ def osm_features(file: MapFile) -> Found:
     scan = _Scan()
     scanned(file, scan)
     skipped: Counter[str] = Counter()
-    things = [*_spots(scan, skipped), *_rows(scan, skipped), *_buildings(scan, skipped)]
+    things = [*_spots(scan, skipped), *_rows(scan, skipped), *_buildings(scan, skipped), *_lands(scan, skipped)]
     return Found(tuple(things), dict(sorted(skipped.items())))
 
 
@@ -174,19 +216,65 @@ def _buildings(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
     for members, tags in scan.areas:
         if not _has_walls(tags, skipped):
             continue
-        outer, inner = (_rings(scan, [ref for ref, r in members if (r == "inner") == is_in]) for is_in in (False, True))
-        if not outer or inner is None:
-            skipped["buildings with an open outline"] += 1
-            continue
-        try:
-            walled = [
-                part for o in outer for part in shapely.get_parts(shapely.difference(o, shapely.union_all(inner)))
-            ]
-        except shapely.errors.GEOSException:
-            skipped["buildings whose outline crosses itself"] += 1
-            continue
+        walled = _outlines(scan, members, "buildings", skipped)
         found += _built(walled, tags, skipped)
     return found
+
+
+def _lands(scan: _Scan, skipped: Counter[str]) -> list[Mapped]:
+    """Pieces of open land. Most maps end in the middle of some: those are left out, and only counted."""
+    found = []
+    for refs, tags in scan.ways.values():
+        kind = _land(tags)
+        if kind is None or "building" in tags or len(refs) < 4 or refs[0] != refs[-1]:
+            continue
+        if tags.get("highway") and tags.get("area") != "yes":
+            continue
+        ring = _points(scan, refs)
+        if ring is None:
+            skipped["pieces of land with missing nodes"] += 1
+        else:
+            found += _covered(kind, [Polygon(ring)], skipped)
+    for members, tags in scan.lands:
+        kind = _land(tags)
+        if kind is not None:
+            found += _covered(kind, _outlines(scan, members, "pieces of land", skipped), skipped)
+    return found
+
+
+def _land(tags: Mapping[str, str]) -> LandKind | None:
+    """What covers the land of an area; None where its tags do not say, or where it lies under or above the ground."""
+    if tags.get("parking") in _ROOFED or tags.get("layer", "0").lstrip("-") not in ("", "0"):
+        return None
+    if tags.get("tunnel", "no") != "no" or tags.get("location") == "underground":
+        return None
+    return next((LAND_OF[pair] for pair in tags.items() if pair in LAND_OF), None)
+
+
+def _covered(kind: LandKind, outlines: Sequence[shapely.Geometry], skipped: Counter[str]) -> list[Mapped]:
+    found = []
+    for outline in outlines:
+        if not isinstance(outline, Polygon) or not outline.is_valid:
+            skipped["pieces of land whose outline crosses itself"] += 1
+        elif SMALLEST_DEG2 < outline.area < LARGEST_LAND_DEG2:
+            found.append(Mapped(kind, _rings_of(outline), 0.0, None))
+    return found
+
+
+def _outlines(
+    scan: _Scan, members: Sequence[tuple[str, str]], what: str, skipped: Counter[str]
+) -> list[shapely.Geometry]:
+    """The areas of a multipolygon, none where they cannot be put together, which is counted."""
+    outer, inner = (_rings(scan, [ref for ref, r in members if (r == "inner") == is_in]) for is_in in (False, True))
+    if not outer or inner is None:
+        skipped[f"{what} with an open outline"] += 1
+        return []
+    try:
+        holes = shapely.union_all(inner)
+        return [part for o in outer for part in shapely.get_parts(shapely.difference(o, holes))]
+    except shapely.errors.GEOSException:
+        skipped[f"{what} whose outline crosses itself"] += 1
+        return []
 
 
 def _rings(scan: _Scan, refs: Sequence[str]) -> list[Polygon] | None:
@@ -213,10 +301,13 @@ def _built(outlines: Sequence[shapely.Geometry], tags: Mapping[str, str], skippe
         elif not SMALLEST_DEG2 < outline.area < LARGEST_DEG2:
             skipped["buildings too small or too large to be one"] += 1
         else:
-            rings = tuple(shapely.get_coordinates(ring) for ring in (outline.exterior, *outline.interiors))
             metres2 = outline.area * math.cos(math.radians(outline.centroid.y)) / METRE_DEG**2
-            found.append(Mapped("building", rings, building_height_m(tags, metres2, skipped), None))
+            found.append(Mapped("building", _rings_of(outline), building_height_m(tags, metres2, skipped), None))
     return found
+
+
+def _rings_of(outline: Polygon) -> tuple[Floats, ...]:
+    return tuple(shapely.get_coordinates(ring) for ring in (outline.exterior, *outline.interiors))
 
 
 def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:

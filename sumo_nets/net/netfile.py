@@ -204,6 +204,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
         left_hand=left_hand,
         terrain=terrain,
         elevation=elevation,
+        planned=any("street_class" in edge.params for edge in raw.edges),
     )
 
 

@@ -17,14 +17,14 @@ from cosim.core.errors import UsageError
 from cosim.core.geometry import Polyline, Pose
 from cosim.core.state import LABELS, Command, RobotState, Street
 from cosim.episode.ports import CameraSpec
-from cosim.place.street_map import StreetMap, Strip
+from cosim.place.street_map import StreetMap, Strip, street_of
 from cosim.spec.scenario import City
 from physics.cameras.bullet_camera import BulletCamera
 from physics.street.buildings import Frontage
 from physics.street.clearance import clear_width, on_driveways
 from physics.street.furniture import CATALOGUE, KINDS, PROP_VARIANTS, Prop, footprints, parts_of, solids_of
 from physics.street.placement import CLEAR_HALF_M, PROP_END_GAP_M, Placement, clear_half_m, street_style
-from physics.world.materials import MATERIALS, PAVINGS, Paving, friction, street_of
+from physics.world.materials import MATERIALS, PAVINGS, Paving, friction
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import CURB_M, TILE_M, Tile, build_tile, key_at, keys_within, kind_of
 from physics.world.world import BulletWorld

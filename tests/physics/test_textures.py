@@ -128,7 +128,7 @@ def test_wrong_sizes_and_names_are_told() -> None:
     """A size that is none, an unknown layer and stacks that do not fit are refused."""
     with pytest.raises(SpecError, match="size_px must be one of 256, 512, 1024, not 100"):
         ground_layers(100)
-    with pytest.raises(UsageError, match=r"unknown texture layer 'lava'\. Valid choices: asphalt,"):
+    with pytest.raises(UsageError, match=r"unknown texture layer 'lava'\. Valid choices: .*asphalt,"):
         ground_layers(256).index("lava")
     with pytest.raises(UsageError, match="one size"):
         joined_layers(ground_layers(256), wall_layers(512))

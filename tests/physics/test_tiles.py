@@ -162,14 +162,14 @@ def test_domes_lie_in_the_triangles_of_the_ground() -> None:
 
 
 def test_the_frontage_is_paved_where_there_are_shops(tiles: dict[Key, Tile]) -> None:
-    """Before shops it is covered from the sidewalk to the houses, without holes or doubles, a little above the ground,
-    with a rim down to it where it ends; a home's driveway reaches from its sidewalk to the houses; the ground itself
-    stays what it was."""
+    """In a generated city it is covered before shops from the sidewalk to the houses, without holes or doubles, a
+    little above the ground, with a rim down to it where it ends; a home's driveway reaches from its sidewalk to the
+    houses; the ground itself stays what it was."""
     changed = {
         "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
         "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
     }
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, _trees={})
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, planned=True, _trees={})
     covered, layers, rims = [], set(), []
     for key in KEYS:
         tile = build_tile(street_map, key)

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from cosim.place.open_ground import GROUND_LOOKS
 from cosim.records.results import summary_of
 from cosim.records.run_folder import RunFolder, read_spec
 from cosim.report.page.choice import most_telling, shown_of
@@ -71,6 +72,18 @@ def test_a_cell_of_ours_is_the_summary_of_its_episodes(tmp_path: Path) -> None:
     assert text.index("the paper's models, in another engine") < text.index("OpenPilot")
     assert text.count('class="paper"') == len(UNIT_OF_PAPER)
     assert 'class="paper"' not in tables_html([own]) and "mine: straight" in tables_html([own])
+
+
+def test_the_page_paints_the_ground_as_maps_from_above(tmp_path: Path) -> None:
+    """Each kind of area of a scene has a colour in the page; those of open ground are the table's of all maps."""
+    data = next(one for one in Elements(page(run_of(tmp_path / "run", [HIT], "mine"))).data if "ground" in dict(one))  # type: ignore[call-overload]
+    assert isinstance(data, dict)
+    assert {kind: tuple(bytes.fromhex(hue[1:])) for kind, hue in data["ground"].items()} == {
+        kind: look.drawn for kind, look in GROUND_LOOKS.items()
+    }
+    script = (ROOT / "cosim/report/page/page.js").read_text()
+    known = re.search(r"const COLOURS = \{ \.\.\.data\.ground, (.*?)\};", script, re.DOTALL)
+    assert known is not None and {"road", "walk", "crossing", "verge"} <= set(re.findall(r"(\w+):", known[1]))
 
 
 @pytest.mark.skipif(not PAPER.exists(), reason="the paper is not here")

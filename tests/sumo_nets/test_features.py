@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from cosim.core.errors import MapError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, Street
-from cosim.place.street_map import Feature, Lane, StreetMap, Strip
+from cosim.place.street_map import LANDS, Feature, Lane, StreetMap, Strip
 from cosim.spec.scenario import CityMap
 from physics.street.buildings import Frontage, facade_meshes
 from physics.street.clearance import clear_width
@@ -117,6 +117,7 @@ def drawn(tmp_path_factory: pytest.TempPathFactory) -> tuple[StreetMap, tuple[st
     inner = drawing.outline(-60, -35, -40, -25, {})
     drawing.relation([(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "building": "yes", "height": "50'"})
     drawing.outline(60, -3, 75, 4, {"building": "yes"})
+    drawing.outline(90, -60, 120, -10, {"amenity": "parking"})
     path = drawing.write(tmp_path_factory.mktemp("drawn") / "drawn.osm")
     import_map(path, "drawn")
     return read_map("drawn"), about_map("drawn").changes
@@ -183,7 +184,7 @@ def test_what_lies_on_the_other_side_of_the_earth_is_left_out(drawn: tuple[Stree
     spots = [(lon, lat) for lon in (-180.0, -165.0, -75.0, 0.0, 105.0, 180.0) for lat in (-85.0, 0.0, 52.5, 85.0)]
     things = [Mapped("tree", (np.array([spot]),), 0.0, None) for spot in spots]
     square = np.array([(0.0, 0.0), (1e-3, 0.0), (1e-3, 1e-3), (0.0, 1e-3), (0.0, 0.0)])
-    things += [Mapped("building", (square + spot,), 9.0, None) for spot in spots]
+    things += [Mapped(kind, (square + spot,), 9.0, None) for spot in spots for kind in ("building", "lawn")]
     assert fitted(Found(tuple(things), {}), location, drawn[0]) == ((), [])
 
 
@@ -207,6 +208,58 @@ def test_nothing_is_made_up_where_the_map_shows_it(drawn: tuple[StreetMap, tuple
     near = shapely.union_all([f.polygon for f in street_map.features if f.kind == "building"])
     assert made_up_houses and min(shapely.distance(b.polygon, near) for b in made_up_houses) > HOUSES_M
     assert len([b for key in keys for b in Frontage(bare, 1).in_tile(key)]) > len(made_up_houses)
+
+
+@pytest.mark.engine
+def test_land_is_shown_and_changes_nothing_that_stands_or_rolls(drawn: tuple[StreetMap, tuple[str, ...]]) -> None:
+    """A parking lot of the file is a yard of the map, told and covered by its hash; without it everything that stands,
+    and the ground that wheels feel, is the same to the bit."""
+    street_map, changes = drawn
+    (lot,) = (f for f in street_map.features if f.kind in LANDS)
+    assert lot.kind == "yard" and "1 x yard" in " | ".join(changes)
+    assert lot.polygon.area == pytest.approx(30.0 * 50.0, rel=0.01)
+    bare = dataclasses.replace(street_map, features=tuple(f for f in street_map.features if f is not lot))
+    assert props_of(street_map, 1) == props_of(bare, 1)
+    shown = []
+    for key in keys_within(lot.x_m, lot.y_m, 30.0):
+        one, other = StreetSurface(street_map, 1), StreetSurface(bare, 1)
+        chunks = [surface.chunk(key) for surface in (one, other)]
+        felt = [[(p.name, p.friction, p.mesh.vertices.tobytes()) for p in chunk.ground] for chunk in chunks]
+        assert felt[0] == felt[1] and chunks[0].buildings == chunks[1].buildings
+        shown += [patch.name for patch in one.covers(key)]
+        assert "ground:yard" not in [patch.name for patch in other.covers(key)]
+    assert "ground:yard" in shown
+
+
+def test_land_is_read_as_mappers_write_it(tmp_path: Path) -> None:
+    """Parks, woods with clearings, water, building sites and parking lots are land; what lies above or below the
+    ground, or is open, torn or a way rather than an area is none."""
+    drawing = Drawing()
+    for x, tags in enumerate(
+        (
+            {"leisure": "park"}, {"landuse": "construction"}, {"amenity": "parking", "parking": "surface"},
+            {"highway": "pedestrian", "area": "yes"}, {"natural": "water"}, {"landuse": "residential"},
+            {"amenity": "parking", "parking": "underground"}, {"amenity": "parking", "building": "yes"},
+            {"highway": "pedestrian"}, {"leisure": "park", "layer": "1"}, {"natural": "water", "tunnel": "culvert"},
+        )
+    ):  # fmt: skip
+        drawing.outline(100.0 * x, 0.0, 100.0 * x + 50.0, 50.0, tags)
+    outer, inner = drawing.outline(0, 100, 90, 190, {}), drawing.outline(30, 130, 60, 160, {})
+    drawing.relation([(outer, "outer"), (inner, "inner")], {"type": "multipolygon", "natural": "wood"})
+    a, b, c, d = (drawing.node(x, y) for x, y in ((0, 0), (9, 9), (9, 0), (0, 9)))
+    drawing.way([a, b, c, d, a], {"leisure": "park"})
+    drawing.way([a, 99_999, b, a], {"leisure": "park"})
+    drawing.way([a, c, b, d], {"leisure": "park"})
+    drawing.relation([(99_998, "outer")], {"type": "multipolygon", "natural": "wood"})
+    things, skipped = drawing.found(tmp_path / "land.osm")
+    lands = [thing for thing in things if thing.kind in LANDS]
+    assert [thing.kind for thing in lands] == ["lawn", "soil", "yard", "yard", "water", "planting"]
+    assert len(lands[-1].rings) == 2
+    assert skipped == {
+        "pieces of land with an open outline": 1,
+        "pieces of land with missing nodes": 1,
+        "pieces of land whose outline crosses itself": 1,
+    }
 
 
 def house(*corners: tuple[float, float], height_m: float = 9.0) -> Feature:
@@ -264,7 +317,8 @@ def test_room_is_kept_for_the_largest_of_each_thing() -> None:
 
 def test_features_survive_their_file_and_change_the_hash(tmp_path: Path) -> None:
     """Written and read they are the same; a broken file is named; a map's hash covers them."""
-    features = (house((0, 0), (9, 0), (9, 9), (0, 9)), Feature("tree", 3.5, -2.25, 0.1, 6.0))
+    lot = Feature("yard", 24.0, 4.0, polygon=shapely.box(20.0, 0.0, 29.0, 8.0))
+    features = (house((0, 0), (9, 0), (9, 9), (0, 9)), Feature("tree", 3.5, -2.25, 0.1, 6.0), lot)
     path = tmp_path / NAME
     assert read_features(path) == () and with_features("abc", path) == "abc"
     write_features(features, path)

@@ -47,7 +47,7 @@
 
   // Viewer
   const viewer = one("#viewer"), canvas = one("#above"), scrub = one("#scrub"), play = one("#play");
-  const COLOURS = { road: "#8b8f95", walk: "#efece4", crossing: "#f4edb4", verge: "#a5cda0", obstacle: "#7d5a34", barrier: "#cf2e2e",
+  const COLOURS = { ...data.ground, road: "#8b8f95", walk: "#efece4", crossing: "#f4edb4", verge: "#a5cda0", obstacle: "#7d5a34", barrier: "#cf2e2e",
     event: "#e06c00", injected: "#e06c00", crowd: "#7d6bb3", resident: "#008c6e", vehicle: "#3c5082" };
   let scene = null, entry = -1, sample = 0, timer = 0, view = null;
 
@@ -163,7 +163,7 @@
   }
   function draw() {
     const c = canvas.getContext("2d");
-    c.fillStyle = "#d9e2d6"; c.fillRect(0, 0, canvas.width, canvas.height);
+    c.fillStyle = COLOURS.lawn; c.fillRect(0, 0, canvas.width, canvas.height);
     for (const [kind, rings] of scene.ground) {
       c.beginPath();
       for (const ring of rings) { path(c, ring); c.closePath(); }

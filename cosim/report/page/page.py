@@ -13,6 +13,7 @@ import numpy as np
 
 from cosim.core.telling import duration, milliseconds
 from cosim.episode.log import holds_waypoints
+from cosim.place.open_ground import GROUND_LOOKS
 from cosim.records.figures import median_answer_ms
 from cosim.records.results import policy_in_words
 from cosim.report.page.plots import CAUSE_COLOURS, RUN_COLOURS, Plot
@@ -71,6 +72,7 @@ def page_of(
         "plots": [plot.figure for plot in plots],
         "causes": CAUSE_COLOURS,
         "maps": maps,
+        "ground": {kind: "#{:02x}{:02x}{:02x}".format(*look.drawn) for kind, look in GROUND_LOOKS.items()},
     }
     scenes = [_json(f"scene-{k}", entry.scene) for k, entry in enumerate(entries) if entry.scene is not None]
     assets = files("cosim.report.page")

@@ -13,7 +13,7 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import Barrier, City, Scenario, Suite, write_suite
 from physics.textures.layers import encoded, linear
 from physics.world.gltf import as_gltf
-from physics.world.materials import PAVINGS
+from physics.world.materials import PAVINGS, SEEN_AS
 from physics.world.mesh_surface import MeshSurface
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import SURFACES, keys_in, kind_of, square
@@ -54,7 +54,7 @@ def test_a_street_is_read_back_as_it_is(street: StreetSurface, file: Path) -> No
         assert mesh.area == pytest.approx(sum(trimesh.Trimesh(m.vertices, m.triangles).area for m in own), rel=1e-4)
         if name in PAVINGS:
             shown = np.array(mesh.visual.material.baseColorFactor[:3]) / 255.0
-            assert shown == pytest.approx(linear(PAVINGS[name]), abs=0.003)
+            assert shown == pytest.approx(linear(SEEN_AS.get(name, (name, PAVINGS[name]))[1]), abs=0.003)
     fence = scene.geometry["barrier:red"]
     assert fence.bounds[:, 1] == pytest.approx([0.57, 1.12], abs=0.02)
     assert fence.bounds.mean(axis=0)[[0, 2]] == pytest.approx([FENCE.x_m, -FENCE.y_m], abs=0.1)
