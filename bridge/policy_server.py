@@ -37,7 +37,8 @@ _MOST_SEATS = 4096
 _FORGOTTEN_AFTER_S = 300.0
 _TAKEN_OVER_AFTER_S = 30.0
 """A policy object that answers for one episode at a time is free again when it was asked nothing for so long."""
-_MOST_NUMBERS = 100_000
+_MOST_ANSWER_BYTES = 2 << 20
+"""A larger array is told by its shape alone: the simulator refuses it, in the words for a policy in any place."""
 _ARRAYS = {"|u1", "<f4"}
 _QUESTIONS = ("reset", "act", "ended")
 
@@ -342,11 +343,13 @@ def _answer(one: AskAct, answer: Any) -> Union[Answer, Refusal]:
         array = np.asarray(answer)
     except (TypeError, ValueError):  # rows of different lengths
         array = np.asarray(None)
-    if array.ndim == 0 or array.dtype.kind not in "biufc" or array.size > _MOST_NUMBERS:
+    if array.ndim == 0 or array.dtype.kind not in "biufc":
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
         return Refusal("policy", f"answered {shown}: neither a Command nor waypoints")
-    return Answer(*one.signature, one.step, waypoints=packed(array))
+    fits = array.nbytes <= _MOST_ANSWER_BYTES
+    told = packed(array) if fits else PackedArray(array.dtype.str, array.shape)
+    return Answer(*one.signature, one.step, waypoints=told)
 
 
 def _crash(error: BaseException, among: str = "") -> bytes:

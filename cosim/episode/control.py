@@ -7,6 +7,7 @@ robots are driven: one waypoint of the answer, to be reached in one time step.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -17,6 +18,8 @@ from cosim.episode.ports import WaypointRule
 from cosim.spec.robot import Robot
 
 EPS_M = 1e-8
+MOST_NUMBERS = 100_000
+"""Of a policy's answer, wherever the policy runs."""
 REAL_KINDS = "iuf"
 """The kinds of numpy that are real numbers: integers, unsigned, floating."""
 _MOST_SHOWN = 80
@@ -51,7 +54,8 @@ def command_of(answer: object, *, rule: WaypointRule, robot: Robot) -> Command:
     """The clipped command in a policy's answer: a Command, or waypoints (N, 2) or (N, 4) of which one is followed, as a
     Planned.
 
-    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule needs, and anything
+    Raises PolicyError, saying what was answered, for NaN, infinities, fewer waypoints than the rule needs, more than
+    MOST_NUMBERS numbers, and anything
     that is not real numbers of that shape: truth values, texts and complex numbers are none.
     """
     if isinstance(answer, Command):
@@ -88,6 +92,7 @@ def _waypoints(answer: object, index: int) -> Floats:
         raise PolicyError(f"answered {_shown(answer)}: neither a Command nor waypoints")
     if array.dtype.kind not in REAL_KINDS:
         raise PolicyError(f"answered an array of {array.dtype.name}: waypoints are real numbers")
+    check_numbers(array.shape)
     if array.ndim != 2 or array.shape[0] < 1 or array.shape[1] not in _COLUMNS:
         raise PolicyError(f"answered an array of shape {array.shape}: waypoints have shape (N, 2) or (N, 4), N >= 1")
     with np.errstate(over="ignore"):
@@ -101,6 +106,15 @@ def _waypoints(answer: object, index: int) -> Floats:
             f"{index + 1}, or say which one in the manifest, as waypoints=WaypointRule(index={len(waypoints) - 1})"
         )
     return waypoints
+
+
+def check_numbers(shape: Sequence[int]) -> None:
+    """Raises PolicyError for an answer whose array of this shape holds more numbers than any may."""
+    if (count := math.prod(shape)) > MOST_NUMBERS:
+        shown = ", ".join(map(str, shape[:4])) + (", ..." if len(shape) > 4 else "," * (len(shape) == 1))
+        raise PolicyError(
+            f"answered an array of shape ({shown}): {count} numbers; an answer holds at most {MOST_NUMBERS}"
+        )
 
 
 def _number(value: object) -> float:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import UsageError, unknown
 from cosim.core.state import LABELS, Command
+from cosim.episode.control import check_numbers
 from cosim.episode.goals import PATCH_PX
 from cosim.episode.ports import CameraSpec, Manifest, Observation
 from cosim.spec.goal import Goal, ImageGoal, Instruction, PointGoal, RoutePatch
@@ -80,8 +81,10 @@ def action_space_of(actions: Actions, manifest: Manifest, robots: Sequence[Robot
 
 
 def action_as_answer(action: NDArray[np.floating[Any]], space: spaces.Box) -> Command | NDArray[np.floating[Any]]:
-    """What a policy would answer. Raises UsageError for an array of another shape than the space's."""
+    """What a policy would answer. Raises UsageError for an array of another shape than the space's, PolicyError for one
+    with more numbers than an answer may hold."""
     array = np.asarray(action)
+    check_numbers(array.shape)
     if array.shape != space.shape:
         raise UsageError(f"an action of shape {array.shape}: this environment's are {space.shape}, {space}")
     return array if array.ndim == 2 else Command(float(array[0]), float(array[1]))

@@ -17,6 +17,7 @@ import numpy as np
 from bridge.policy_server import Answer, AskAct, AskEnded, AskReset, Begun, PackedArray, Refusal
 from cosim.core.errors import MachineError, PolicyError, PolicyServerLost
 from cosim.core.state import Command
+from cosim.episode.control import check_numbers
 from cosim.episode.driver import MOST_SAID, Driver, PolicyCall, Timer
 from cosim.episode.ports import Manifest, Observation
 from cosim.spec.policy_host import PolicyRuns
@@ -143,6 +144,7 @@ def _array(told: PackedArray) -> np.ndarray[Any, Any]:
         kind = np.dtype(told.dtype)
         if kind.kind not in "biufc" or any(side < 0 for side in told.shape) or told.at >= 0:
             raise ValueError(f"an array of {told.dtype} {told.shape}")
+        check_numbers(told.shape)
         return np.frombuffer(told.data, kind).reshape(told.shape)
     except (TypeError, ValueError, OverflowError) as error:
         raise PolicyError(f"answered waypoints that cannot be read: {error}"[:MOST_SAID]) from None

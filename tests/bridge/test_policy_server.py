@@ -50,6 +50,9 @@ SPEC = CameraSpec(64, 40)
 RGB = np.arange(40 * 64 * 3, dtype=np.uint8).reshape(40, 64, 3)
 
 
+SIZES = {"most": (50_000, 2), "many": (50_001, 2), "far too many": (2_000_000, 2)}
+
+
 class Counting:
     """Its speed is the number of the question in its episode, in tenths; in some it does what they are called."""
 
@@ -73,6 +76,8 @@ class Counting:
             return {"v_mps": float("nan"), "w_radps": 0.0}
         if seen.episode == "words":
             return "left"
+        if seen.episode in SIZES:
+            return np.zeros(SIZES[seen.episode])
         if seen.episode == "slow":
             time.sleep(0.6)
         return {"v_mps": self.count / 10.0, "w_radps": 0.0}
@@ -176,7 +181,12 @@ def test_a_remote_policy_is_asked_as_one_here(hub: Connection) -> None:
             "raises": "policy 'counting' raised KeyError: 'no such weight' .act at 0.25 s.",
             "nan": "answered Command.v_mps=nan, w_radps=0.0.: both must be finite",
             "words": "answered 'left': neither a Command nor waypoints",
+            "many": r"answered an array of shape \(50001, 2\): 100002 numbers; an answer holds at most 100000 \(act at",
+            "far too many": r"answered an array of shape \(2000000, 2\): 4000000 numbers; an answer holds at",
         }
+        driver.ended()
+        driver.reset("most", 7)
+        assert driver.act(seen_at(5, "most")).v_mps == 0.0
         driver.ended()
         for name, words in told.items():
             driver.reset(name, 7)

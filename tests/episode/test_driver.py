@@ -258,6 +258,8 @@ def test_a_bad_answer_in_a_batch_is_one_episodes_crash() -> None:
     """The other one has its command."""
     good, bad = of_two(lambda _: [STILL, Command(float("nan"), 0.0)])
     assert good == STILL and "must be finite numbers (act at 0.20 s)" in str(bad)
+    good, bad = of_two(lambda _: [STILL, np.zeros((50_001, 2))])
+    assert good == STILL and "(50001, 2): 100002 numbers; an answer holds at most 100000 (act at 0.20 s)" in str(bad)
 
 
 @pytest.mark.parametrize(

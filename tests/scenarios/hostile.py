@@ -134,6 +134,11 @@ def error(self: Hostile, seen: Observation) -> object:
 
 
 @act
+def too_many_numbers(self: Hostile, seen: Observation) -> object:
+    return np.zeros((50_001, 2))
+
+
+@act
 def exit_(self: Hostile, seen: Observation) -> object:
     sys.exit("enough")
 

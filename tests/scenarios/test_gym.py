@@ -18,7 +18,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import cosim
-from cosim.core.errors import SpecError, UsageError
+from cosim.core.errors import PolicyError, SpecError, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import Command, RobotState
 from cosim.episode.ports import CameraSpec, Manifest, Observation, WaypointRule
@@ -114,6 +114,8 @@ def test_answers_are_commands_or_waypoints_of_the_manifest() -> None:
     assert several.shape == (4, 2) and several.high.max() == pytest.approx(2.5 * 0.2 / 0.25)
     with pytest.raises(UsageError, match=r"shape \(2,\): this environment's are \(4, 2\)"):
         action_as_answer(np.float32([1.5, 0.25]), several)
+    with pytest.raises(PolicyError, match="100002 numbers; an answer holds at most 100000"):
+        action_as_answer(np.zeros((50_001, 2), np.float32), several)
 
 
 def test_every_shipped_suite_has_an_id_of_its_major_version() -> None:

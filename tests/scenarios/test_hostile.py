@@ -57,6 +57,8 @@ EXPECTED: dict[str, str] = {
     "ragged": "answered [[1.0, 0.0], [1.0]]: neither a Command nor waypoints",
     "wrong-shape": "answered an array of shape (3, 7)",
     "no-waypoint": "answered an array of shape (0, 2)",
+    "too-many-numbers": "policy 'hostile' answered an array of shape (50001, 2): 100002 numbers; an answer holds "
+    "at most 100000 (act at 0.50 s)",
     "a-coroutine": "answered a coroutine: neither a Command nor waypoints",
     "an-unreal-float": "raised KeyboardInterrupt",
     "without-end": "policy 'hostile' ",

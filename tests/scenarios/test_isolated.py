@@ -33,6 +33,9 @@ CRASHED = {
     "ends": "policy 'honest' gave no answer: the policy process ended with exit code 0 (act at 0.25 s)",
     "pretends": "policy 'honest' raised PolicyServerLost: the server is gone (act at 0.25 s)",
     "stops-itself": f"policy 'honest' gave no answer for {ANSWER_S:g} s in act at 0.25 s of stops-itself",
+    "too-many-numbers": "policy 'honest' answered an array of shape (50001, 2): 100002 numbers; an answer holds "
+    "at most 100000 (act at 0.25 s)",
+    "far-too-many-numbers": "answered an array of shape (1000000, 4): 4000000 numbers; an answer holds at most 100000",
     "hangs-afterwards": f"policy 'honest' gave no answer for {ANSWER_S:g} s in ended of hangs-afterwards",
 }
 """Those that give no answer, by their own fault; all others are done."""
