@@ -37,8 +37,7 @@ _MOST_SEATS = 4096
 _FORGOTTEN_AFTER_S = 300.0
 _TAKEN_OVER_AFTER_S = 30.0
 """A policy object that answers for one episode at a time is free again when it was asked nothing for so long."""
-_MOST_ANSWER_BYTES = 2 << 20
-"""A larger array is told by its shape alone: the simulator refuses it, in the words for a policy in any place."""
+_MOST_ANSWER_BYTES = 2 << 20  # of a larger array only the shape is sent, and the simulator refuses it
 _ARRAYS = {"|u1", "<f4"}
 _QUESTIONS = ("reset", "act", "ended")
 
@@ -314,12 +313,13 @@ def _unpacked(told: PackedArray, memory: memoryview | None) -> Any:
         return _from_jpeg(told.data).reshape(told.shape)
     if told.dtype not in _ARRAYS or any(side < 0 for side in told.shape):
         raise ValueError(f"an array of {told.dtype} {told.shape}")
-    count = int(np.prod(told.shape, dtype=np.int64))
     if told.at < 0:
         return np.frombuffer(told.data, told.dtype).reshape(told.shape).copy()
     if memory is None:
         raise ValueError("no memory is shared")
-    return np.frombuffer(memory, told.dtype, count, told.at).reshape(told.shape).copy()
+    return (
+        np.frombuffer(memory, told.dtype, int(np.prod(told.shape, dtype=np.int64)), told.at).reshape(told.shape).copy()
+    )
 
 
 def _answered(one: AskAct, answer: Any) -> bytes:
@@ -347,8 +347,7 @@ def _answer(one: AskAct, answer: Any) -> Union[Answer, Refusal]:
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
         return Refusal("policy", f"answered {shown}: neither a Command nor waypoints")
-    fits = array.nbytes <= _MOST_ANSWER_BYTES
-    told = packed(array) if fits else PackedArray(array.dtype.str, array.shape)
+    told = packed(array) if array.nbytes <= _MOST_ANSWER_BYTES else PackedArray(array.dtype.str, array.shape)
     return Answer(*one.signature, one.step, waypoints=told)
 
 
