@@ -10,7 +10,7 @@ import re
 import shutil
 import subprocess
 import xml.etree.ElementTree as ET
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,8 +27,16 @@ from sumo_nets.maps.featurefit import fitted
 from sumo_nets.maps.importrules import NEWEST_RULES, Rules
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
+from sumo_nets.maps.sidewalks import (
+    SIDEWALK_WIDTH_M,
+    STREET_WIDTHS_M,
+    new_share,
+    pavements,
+    set_widths,
+    untagged_share,
+)
 from sumo_nets.net.netconvert import complaints, netconvert
-from sumo_nets.net.netfacts import allows, facts_of, footway, net_root, read_facts
+from sumo_nets.net.netfacts import allows, facts_of, net_root, read_facts
 from sumo_nets.net.netfile import read_net
 
 TIMEOUT_S = 300.0
@@ -72,12 +80,14 @@ class Options:
     bbox: west, south, east, north in degrees, or x0, y0, x1, y1 of a net without a projection.
     lefthand: None to look it up.
     as_is: leave a SUMO net unchanged, even one without sidewalks.
+    sidewalk_width_m: of all guessed sidewalks; None for the widths of the rules, by street class.
     rules: the version of the importer.
     """
 
     bbox: _Box | None = None
     lefthand: bool | None = None
     as_is: bool = False
+    sidewalk_width_m: float | None = None
     rules: Rules = NEWEST_RULES
 
     def __post_init__(self) -> None:
@@ -85,6 +95,20 @@ class Options:
             west, south, east, north = self.bbox
             if not all(map(math.isfinite, self.bbox)) or west >= east or south >= north:
                 raise UsageError(f"bbox must be west,south,east,north with west < east, south < north: {self.bbox}")
+        if self.sidewalk_width_m is not None:
+            low_m, high_m = SIDEWALK_WIDTH_M
+            if not low_m <= self.sidewalk_width_m <= high_m:
+                raise UsageError(
+                    f"--sidewalk-width must be {low_m:g} to {high_m:g} metres, not {self.sidewalk_width_m:g}"
+                )
+            if self.as_is:
+                raise UsageError("--sidewalk-width changes a net and --as-is leaves it unchanged: give one of them")
+
+    @property
+    def widths_m(self) -> Mapping[str, float]:
+        """Widths of guessed sidewalks by street class; empty to leave them as netconvert chose them."""
+        one_m = self.sidewalk_width_m
+        return self.rules.widths_m if one_m is None else dict.fromkeys(STREET_WIDTHS_M, one_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,8 +155,8 @@ def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str])
         f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed wherever pavements "
         "meet a road; railways and isolated streets left out, junctions and signals close together joined"
     )
-    root = net_root(net)
-    share = _guessed(root, found.tagged)
+    net = _widened(folder, net, options, found.widths, frozenset(), changes)
+    share = untagged_share(net_root(net), found.tagged)
     if share:
         changes.append(f"guessed {share:.0%} of the pavement's length: the file does not speak of it")
     licences = [OSM_LICENCE, found.licence] if found.licence else [OSM_LICENCE]
@@ -144,14 +168,15 @@ def _from_net(file: MapFile, folder: Path, options: Options, changes: list[str])
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
     net = file.path
-    before = {edge.get("id") for edge in net_root(net).iter("edge") if _pavement(edge) is not None}
+    before = frozenset(pavements(net_root(net)))
     net = _crop(file, folder, net, options.bbox, changes)
     if options.as_is:
         return _unchanged(file, net, facts, changes)
     share: float | None = None
     if _lacks_walkways(facts):
-        net = _upgraded(file, folder, net, facts, changes)
-        share = _new_share(net_root(net), before)
+        net = _upgraded(folder, net, facts, changes)
+        net = _widened(folder, net, options, {}, before, changes)
+        share = new_share(net_root(net), before)
     elif _old(facts.version):
         net = _netconvert(folder, "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
@@ -254,7 +279,26 @@ def _crop(file: MapFile, folder: Path, net: Path, bbox: _Box | None, changes: li
     return net
 
 
-def _upgraded(file: MapFile, folder: Path, net: Path, facts: NetFacts, changes: list[str]) -> Path:
+def _widened(
+    folder: Path,
+    net: Path,
+    options: Options,
+    tagged: Mapping[str, Mapping[str, str]],
+    before: Collection[str],
+    changes: list[str],
+) -> Path:
+    """The net with the widths of guessed sidewalks set, see `set_widths`."""
+    root = net_root(net)
+    said = set_widths(root, options.widths_m, tagged, before)
+    if not said:
+        return net
+    changes += said
+    ready = folder / "widths.net.xml"
+    ET.ElementTree(root).write(ready, encoding="UTF-8", xml_declaration=True)
+    return _netconvert(folder, "widened.net.xml", ["-s", str(ready)])
+
+
+def _upgraded(folder: Path, net: Path, facts: NetFacts, changes: list[str]) -> Path:
     """The net with sidewalks beside slow roads, crossings and walking areas."""
     root = net_root(net)
     freed = 0
@@ -280,40 +324,6 @@ def _upgraded(file: MapFile, folder: Path, net: Path, facts: NetFacts, changes: 
 def _is_footway(edge: ET.Element) -> bool:
     slow = float(edge[0].get("speed", "13.9")) <= FOOT_MPS
     return slow or edge.get("type", "") in FOOT_TYPES
-
-
-def _pavement(edge: ET.Element) -> ET.Element | None:
-    """The lane for walking of an edge, unless it is shared with cars."""
-    walked = None if edge.get("function") else footway(edge)
-    return None if walked is None or walked[1] == "mixed" else walked[0]
-
-
-def _new_share(root: ET.Element, before: set[str | None]) -> float:
-    """Part of the pavements' length on edges that had none before."""
-    lanes = {edge.get("id"): lane for edge in root.iter("edge") if (lane := _pavement(edge)) is not None}
-    metres = {name: float(lane.get("length", "0")) for name, lane in lanes.items()}
-    new_m = sum(m for name, m in metres.items() if name not in before)
-    return new_m / max(sum(metres.values()), 1e-9)
-
-
-def _guessed(root: ET.Element, tagged: frozenset[str]) -> float:
-    """Part of the walkways' length that lies beside roads whose OSM ways do not speak of sidewalks."""
-    total_m = guessed_m = 0.0
-    for edge in root.iter("edge"):
-        lane = _pavement(edge)
-        if lane is None:
-            continue
-        length_m = float(lane.get("length", "0"))
-        total_m += length_m
-        if len(edge.findall("lane")) > 1:
-            ways = {
-                way
-                for param in edge.iter("param")
-                if param.get("key") == "origId"
-                for way in re.findall(r"\d+", param.get("value", ""))
-            }
-            guessed_m += length_m * (not ways & tagged)
-    return guessed_m / max(total_m, 1e-9)
 
 
 def _old(version: str) -> bool:

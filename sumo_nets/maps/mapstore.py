@@ -50,6 +50,7 @@ class About(msgspec.Struct, frozen=True, kw_only=True):
     bbox: tuple[float, float, float, float] | None
     lefthand: bool | None
     as_is: bool = False
+    sidewalk_width_m: float | None = None
     versions: dict[str, str]
     changes: tuple[str, ...]
     guessed_share: float | None
@@ -205,6 +206,7 @@ def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -
                 bbox=options.bbox,
                 lefthand=options.lefthand,
                 as_is=options.as_is,
+                sidewalk_width_m=options.sidewalk_width_m,
                 versions={"importer": str(options.rules.version), "eclipse-sumo": version("eclipse-sumo")},
                 changes=made.changes,
                 guessed_share=made.guessed_share,

@@ -314,7 +314,7 @@ def _has_walls(tags: Mapping[str, str], skipped: Counter[str]) -> bool:
     if tags.get("building", "no") in FLAT:
         skipped["roofs, ruins and plans of buildings"] += 1
         return False
-    hangs = any((_metres(tags.get(key, "0")) or 0.0) > 0.0 for key in ("min_height", "building:min_level"))
+    hangs = any((metres(tags.get(key, "0")) or 0.0) > 0.0 for key in ("min_height", "building:min_level"))
     if hangs or tags.get("layer", "0").startswith("-") or tags.get("location") == "underground":
         skipped["buildings above or under the ground"] += 1
         return False
@@ -334,14 +334,14 @@ def _height(tags: Mapping[str, str], key: str, skipped: Counter[str]) -> float:
     """What a tag says in metres or storeys; 0 when it says nothing, or nothing usable, which is counted."""
     if key not in tags:
         return 0.0
-    said = _metres(tags[key])
+    said = metres(tags[key])
     if said is None or not said < ABSURD_M:
         skipped["heights that cannot be read or cannot be"] += 1
         return 0.0
     return said
 
 
-def _metres(words: str) -> float | None:
+def metres(words: str) -> float | None:
     """A number with or without a unit of length in metres ("12", "12.5 m", "12,5", "40'", "40 ft"); None for others."""
     text = words.strip().lower().replace(",", ".")
     feet = re.fullmatch(rf"({_NUMBER.pattern})\s*(?:'|ft|feet)(?:\s*({_NUMBER.pattern})\s*(?:\"|in))?", text)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, Protocol
@@ -42,7 +43,9 @@ class MapFile:
 class OsmFacts:
     """What an OSM file holds. centre: median longitude and latitude of its nodes, degrees.
 
-    roads, ways_on_foot: counts of highway ways. tagged: ids of roads whose tags speak of their sidewalks.
+    roads, ways_on_foot: counts of highway ways.
+    tagged: ids of roads whose tags speak of their sidewalks.
+    widths: tags of roads that give widths of their sidewalks, by the roads' ids.
     """
 
     nodes: int
@@ -51,6 +54,7 @@ class OsmFacts:
     ways_on_foot: int
     centre: tuple[float, float]
     tagged: frozenset[str]
+    widths: Mapping[str, Mapping[str, str]]
     licence: str
 
 
@@ -119,6 +123,7 @@ class _Scan:
     fast: int = 0
     on_foot: int = 0
     tagged: set[str] = field(default_factory=set)
+    widths: dict[str, dict[str, str]] = field(default_factory=dict)
     head: dict[str, str] = field(default_factory=dict)
     way: str | None = None
     tags: dict[str, str] = field(default_factory=dict)
@@ -148,6 +153,8 @@ class _Scan:
             self.fast += highway in FAST and not tagged
             if tagged:
                 self.tagged.add(self.way)
+                if widths := {k: v for k, v in self.tags.items() if k.startswith("sidewalk:") and k.endswith("width")}:
+                    self.widths[self.way] = widths
         self.way = None
 
 
@@ -213,4 +220,5 @@ def osm_facts(file: MapFile) -> OsmFacts:
             f"{file.source}: its nodes lie at longitude {lon:g}, latitude {lat:g}: not degrees; reproject it to WGS 84"
         )
     licence = " ".join(scan.head[key] for key in ("copyright", "attribution", "license") if key in scan.head)
-    return OsmFacts(len(scan.lonlat), scan.ways, scan.roads, scan.on_foot, (lon, lat), frozenset(scan.tagged), licence)
+    tagged = frozenset(scan.tagged)
+    return OsmFacts(len(scan.lonlat), scan.ways, scan.roads, scan.on_foot, (lon, lat), tagged, scan.widths, licence)

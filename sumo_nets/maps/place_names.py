@@ -145,5 +145,5 @@ def _free_name(wanted: str, content: str, is_same: Callable[[About], bool]) -> s
 
 def _as_it_is(about: About) -> bool:
     """Whether a map was imported by this version with no options."""
-    plain = about.bbox is None and about.lefthand is None and not about.as_is
+    plain = about.bbox is None and about.lefthand is None and not about.as_is and about.sidewalk_width_m is None
     return plain and about.versions.get("importer") == str(NEWEST_RULES.version)

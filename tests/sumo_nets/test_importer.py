@@ -8,6 +8,7 @@ import json
 import re
 import xml.etree.ElementTree as ET
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 
 import pytest
@@ -36,7 +37,7 @@ from sumo_nets.maps.mapstore import (
     outdated,
     read_map,
 )
-from sumo_nets.maps.signalcheck import mend_signals
+from sumo_nets.maps.signalcheck import lengthen_walks, mend_signals
 from sumo_nets.net.netconvert import netconvert
 from sumo_nets.net.netfacts import read_facts, walks_of
 from sumo_nets.net.netfile import read_net
@@ -188,6 +189,45 @@ def test_as_is_leaves_a_net_unchanged(tmp_path: Path) -> None:
     assert not check.usable
     with pytest.raises(UsageError, match="an OpenStreetMap file is always converted"):
         import_map(source, options=Options(as_is=True))
+
+
+def streets_of_each_class() -> str:
+    """A town of residential streets, of which one is primary and two have sidewalks with tagged widths."""
+    text = osm(sidewalk="")
+    for way, tags in (
+        ("100", {"highway": "primary"}),
+        ("201", {"highway": "tertiary", "sidewalk": "both", "sidewalk:both:width": "2.8 m"}),
+        ("202", {"sidewalk:left:width": "1.6", "sidewalk:right:width": "13'", "sidewalk:both": "yes"}),
+    ):
+        head, tail = text.split(f'<way id="{way}">')
+        refs, rest = tail.split("</way>", 1)
+        kept_tags = "" if "highway" in tags else '<tag k="highway" v="residential"/>'
+        said = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+        text = f'{head}<way id="{way}">{refs[: refs.index("<tag")]}{kept_tags}{said}</way>{rest}'
+    return text
+
+
+@pytest.mark.engine
+def test_guessed_sidewalks_have_the_width_of_their_street(tmp_path: Path, cosim: Cosim) -> None:
+    """Their width follows the street's class, tagged widths win, side by side; --sidewalk-width sets all others."""
+    source = written(tmp_path / "town.osm", streets_of_each_class())
+    about = import_map(source, "town")
+    strips = read_map("town").strips
+    widths = {name: strips[name].width_m for name in ("100#0", "-203#1", "201#1", "-201#1", "202#1", "-202#1", "300")}
+    assert widths == {
+        "100#0": 3.5, "-203#1": 2.5, "201#1": 2.8, "-201#1": 2.8, "202#1": 3.96, "-202#1": 1.6, "300": 2.0,
+    }  # fmt: skip
+    (said,) = [change for change in about.changes if change.startswith("sidewalks are")]
+    assert "2.5 m beside residential streets (" in said and "as tagged beside others (" in said
+    cars = netconvert(["--osm-files", str(source), "--speed.factor=0.5"], tmp_path / "cars.net.xml")
+    import_map(cars)
+    strips = read_map("cars").strips
+    assert (strips["100#0"].width_m, strips["-203#1"].width_m) == (3.5, 2.5)
+    done = cosim("map", "import", str(cars), "--sidewalk-width", "4.2")
+    assert done.returncode == 0 and "4.2 m beside primary streets" in done.stdout, done.stderr
+    assert {s.width_m for s in read_map("cars").strips.values() if s.road_side} == {4.2}
+    done = cosim("map", "import", str(cars), "--sidewalk-width", "0.4")
+    assert done.returncode == 2 and "--sidewalk-width must be 1 to 10 metres, not 0.4" in done.stderr
 
 
 @pytest.mark.engine
@@ -342,6 +382,48 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
     assert walks_of(root).never == [] and mend_signals(root) == []
     special = ET.fromstring(net.replace("static", "NEMA"))
     assert "left as they are" in mend_signals(special)[0] and walks_of(special).never == [":J_c0"]
+
+
+def test_greens_too_short_to_walk_are_lengthened() -> None:
+    """Each green lasts as long as the crossing takes; no state changes, so nothing goes together that did not before.
+
+    The seconds come from the program's long phases; a program that is not fixed is left alone, and named.
+    """
+    net = """<net version="1.20"><edge id=":J_c0" function="crossing"><lane id=":J_c0_0" length="12"/></edge>
+      <edge id=":J_c1" function="crossing"><lane id=":J_c1_0" length="6"/></edge>
+      <tlLogic id="J" type="static" programID="0" offset="0"><phase duration="40" state="Grr"/>
+      <phase duration="3" state="yrr"/><phase duration="5" state="rGG"/><phase duration="4" state="rrr"/></tlLogic>
+      <connection from=":J_w0" to=":J_c0" tl="J" linkIndex="1"/>
+      <connection from=":J_w0" to=":J_c1" tl="J" linkIndex="2"/></net>"""
+    root = ET.fromstring(net)
+    (said,) = lengthen_walks(root)
+    assert said.endswith("longer for 2 crossings of 1 signals, by up to 9 s; no cycle is longer")
+    phases = [(p.get("duration"), p.get("state")) for p in root.iter("phase")]
+    assert phases == [("31", "Grr"), ("3", "yrr"), ("14", "rGG"), ("4", "rrr")]
+    assert lengthen_walks(root) == []
+    full = ET.fromstring(net.replace('"40"', '"12"'))
+    assert lengthen_walks(full)[0].endswith("1 cycles are up to 7 s longer")
+    for other in (net.replace("static", "actuated"), net.replace('"yrr"', '"yrr" next="2"')):
+        special = ET.fromstring(other)
+        assert lengthen_walks(special) == [
+            "green too short to walk at 1 signals, left as it is (not a fixed program): J"
+        ] and ET.tostring(special) == ET.tostring(ET.fromstring(other))
+
+
+@pytest.mark.engine
+def test_greens_of_imported_signals_are_long_enough(tmp_path: Path) -> None:
+    """In a town of one-way streets with signals netconvert's greens of 5 s are too short; after the import none is."""
+    signal = '><tag k="highway" v="traffic_signals"/></node>\n<node'
+    text = osm(highway="primary", blocks=2).replace("/>\n<node", signal)
+    text = text.replace('v="primary"/>', 'v="primary"/><tag k="lanes" v="4"/><tag k="oneway" v="yes"/>')
+    about = import_map(written(tmp_path / "wide.osm", text))
+    crossings = [s for s in read_map("wide").strips.values() if s.signalised and s.plan is not None]
+    assert len(crossings) >= 6 and any("green too short" in change for change in about.changes)
+    for strip in crossings:
+        assert strip.plan is not None
+        phases = zip(strip.plan.walks, strip.plan.durations_ms, strict=True)
+        greens = [sum(ms for _, ms in run) / 1000.0 for go, run in groupby(phases, lambda phase: phase[0]) if go]
+        assert min(greens) >= strip.length_m / 1.2 + 4.0 - 0.01, strip.id
 
 
 def test_torn_corners_are_widened_and_good_ones_left_alone(tmp_path: Path) -> None:

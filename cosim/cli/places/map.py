@@ -49,12 +49,17 @@ def import_(
     as_is: Annotated[
         bool, typer.Option("--as-is", help="Leave a SUMO net unchanged: add no sidewalks and crossings, mend nothing.")
     ] = False,
+    sidewalk_width: Annotated[
+        float | None,
+        typer.Option(help="Metres, of every guessed sidewalk, 1 to 10; by default 2.5 to 3.5 by the street's class."),
+    ] = None,
 ) -> None:
     """Import a map: convert it, mend what can be mended, check it, keep it under a name."""
     from sumo_nets.maps.importer import Options
     from sumo_nets.maps.mapstore import checked_map, import_map
 
-    options = Options(bbox=None if bbox is None else box_of("--bbox", bbox), lefthand=lefthand, as_is=as_is)
+    box = None if bbox is None else box_of("--bbox", bbox)
+    options = Options(bbox=box, lefthand=lefthand, as_is=as_is, sidewalk_width_m=sidewalk_width)
     with doing(f"converting {file.name}") as tell:
         about = import_map(file, name, options)
         tell(f"checking {about.name}")
