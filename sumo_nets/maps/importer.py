@@ -28,8 +28,8 @@ from sumo_nets.maps.importrules import NEWEST_RULES, Rules
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.maps.sidewalks import (
-    SIDEWALK_WIDTH_M,
     STREET_WIDTHS_M,
+    WIDTH_LIMITS_M,
     new_share,
     pavements,
     set_widths,
@@ -96,7 +96,7 @@ class Options:
             if not all(map(math.isfinite, self.bbox)) or west >= east or south >= north:
                 raise UsageError(f"bbox must be west,south,east,north with west < east, south < north: {self.bbox}")
         if self.sidewalk_width_m is not None:
-            low_m, high_m = SIDEWALK_WIDTH_M
+            low_m, high_m = WIDTH_LIMITS_M
             if not low_m <= self.sidewalk_width_m <= high_m:
                 raise UsageError(
                     f"--sidewalk-width must be {low_m:g} to {high_m:g} metres, not {self.sidewalk_width_m:g}"

@@ -23,7 +23,7 @@ The German RASt 06 (6.1.6.1) has 2.5 m as the standard: 1.8 m for two persons, 0
 Their EFA 2002 asks for 3.3 m where homes and shops mix, and NACTO's Urban Street Design Guide for 2.4 to 3.7 m in
 business districts. Tertiary and primary streets are interpolated.
 """
-SIDEWALK_WIDTH_M: Final = 1.0, 10.0
+WIDTH_LIMITS_M: Final = 1.0, 10.0
 """Narrowest and widest sidewalk that can be asked for; on less than 1 m a robot and a person cannot pass."""
 _TAGGED_M: Final = 0.5, 20.0
 """Tagged widths outside of this are ignored."""
