@@ -313,13 +313,12 @@ def _unpacked(told: PackedArray, memory: memoryview | None) -> Any:
         return _from_jpeg(told.data).reshape(told.shape)
     if told.dtype not in _ARRAYS or any(side < 0 for side in told.shape):
         raise ValueError(f"an array of {told.dtype} {told.shape}")
+    count = int(np.prod(told.shape, dtype=np.int64))
     if told.at < 0:
         return np.frombuffer(told.data, told.dtype).reshape(told.shape).copy()
     if memory is None:
         raise ValueError("no memory is shared")
-    return (
-        np.frombuffer(memory, told.dtype, int(np.prod(told.shape, dtype=np.int64)), told.at).reshape(told.shape).copy()
-    )
+    return np.frombuffer(memory, told.dtype, count, told.at).reshape(told.shape).copy()
 
 
 def _answered(one: AskAct, answer: Any) -> bytes:
@@ -339,10 +338,9 @@ def _answer(one: AskAct, answer: Any) -> Union[Answer, Refusal]:
             v_mps, w_radps = (np.inf if isinstance(v, int) and v.bit_length() > 1000 else float(v) for v in speeds)
             return Answer(*one.signature, one.step, v_mps, w_radps)
         return Refusal("policy", f"answered Command{tuple(speeds)!r}"[:MOST_WORDS] + ": both must be finite numbers")
-    try:
+    array = np.asarray(None)
+    with suppress(TypeError, ValueError):  # rows of different lengths
         array = np.asarray(answer)
-    except (TypeError, ValueError):  # rows of different lengths
-        array = np.asarray(None)
     if array.ndim == 0 or array.dtype.kind not in "biufc":
         shown = repr(answer)
         shown = shown if len(shown) <= 80 and shown.isprintable() else f"a {type(answer).__name__}"
