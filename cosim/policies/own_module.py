@@ -93,7 +93,8 @@ def _located(name: str, path: Path) -> _File:
     """Raises UsageError where the file is missing, or cannot be imported under its name."""
     if not path.is_file():
         here = sorted(file.name for file in path.parent.glob(f"*{_SUFFIX}")) if path.parent.is_dir() else []
-        there = f"Python files in {path.parent.absolute()}: {', '.join(here) or 'none'}.{nearest(path.name, here)}"
+        meant = f" Did you mean {found[0]}?" if (found := _files_below(path.name)) else nearest(path.name, here)
+        there = f"Python files in {path.parent.absolute()}: {', '.join(here) or 'none'}.{meant}"
         raise UsageError(f"policy '{name}': there is no file {path.absolute()}. {there}")
     file = Path(os.path.abspath(path))  # noqa: PTH100  a link keeps its name
     root, parts = file.parent, [] if file.stem == "__init__" else [file.stem]
@@ -127,10 +128,15 @@ def remedy_for_missing(name: str, missing: str) -> str:
     searched = f"Searched: {', '.join(folders)}."
     if missing != module_name and not module_name.startswith(f"{missing}."):
         return f"{searched} Install '{missing}' for {sys.executable}, or add its folder to PYTHONPATH"
-    tail = f"{module_name.replace('.', '/').removesuffix('/py')}{_SUFFIX}"
-    found = [file for below in ("", "*/", "*/*/") for file in sorted(Path.cwd().glob(f"{below}{Path(tail).name}"))]
-    given = f"{found[0].relative_to(Path.cwd())}" if found else f"path/to/{Path(tail).name}"
+    tail = f"{module_name.replace('.', '/')}{_SUFFIX}"
+    given = next(iter(_files_below(Path(tail).name)), Path("path/to", Path(tail).name))
     return (
         f"{searched} Run the command in the folder that holds {tail}, add that folder to PYTHONPATH, or name the file: "
         f"{given}:{class_name}"
     )
+
+
+def _files_below(name: str) -> list[Path]:
+    """The files of a name in the current folder and in two levels of folders below it, as relative paths."""
+    here = Path.cwd()
+    return [file.relative_to(here) for below in ("", "*/", "*/*/") for file in sorted(here.glob(f"{below}{name}"))]

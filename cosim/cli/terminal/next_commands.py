@@ -21,4 +21,4 @@ def print_next_commands(err: Console, folder: Path, table: pd.DataFrame) -> None
         first = shlex.quote(str((failed if len(failed) else ended)["scenario"].iloc[0]))
         shown = "--failure" if len(failed) else first
         lines = [f"cosim film {run} {shown} -o film.mp4", *lines, f"cosim show {run} --episode {first}"]
-    err.print("Next:", *(f"  {line}" for line in lines), sep="\n", soft_wrap=True, highlight=False, markup=False)
+    err.print("\n  ".join(["Next:", *lines]), soft_wrap=True, highlight=False, markup=False)

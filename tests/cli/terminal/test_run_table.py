@@ -234,6 +234,7 @@ def test_the_next_commands_are_printed_with_the_runs_folder() -> None:
         said = io.StringIO()
         table = pd.DataFrame(rows, columns=["scenario", "ended", "success"])
         print_next_commands(Console(file=said, width=40), Path("runs/my run"), table)
+        assert said.getvalue().endswith("\n")
         return [line.strip() for line in said.getvalue().splitlines()]
 
     report = "cosim report 'runs/my run' -o report.html"
