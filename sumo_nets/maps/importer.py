@@ -25,6 +25,7 @@ from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.featurefit import fitted
 from sumo_nets.maps.importrules import NEWEST_RULES, Rules
+from sumo_nets.maps.levels import LEVEL_KEYS, edges_of
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.maps.sidewalks import (
@@ -61,7 +62,7 @@ OSM_OPTIONS = (
     "--output.street-names",
     "--output.original-names",
     "--osm.all-attributes",
-    "--osm.extra-attributes=bridge,tunnel,layer",
+    f"--osm.extra-attributes={','.join(LEVEL_KEYS)}",
 )
 UPGRADE_OPTIONS = ("--sidewalks.guess", "--crossings.guess", "--walkingareas")
 FOOT_TYPES = ("highway.footway", "highway.pedestrian", "highway.steps", "highway.path")
@@ -146,6 +147,10 @@ def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str])
             f"{file.source}: --as-is is for SUMO nets; an OpenStreetMap file is always converted: leave --as-is out"
         )
     extra = ["--lefthand"] if _left_hand(found, options, changes) else []
+    # Joined to a street on the ground, a bridge would take all of the street off the ground.
+    apart = folder / "apart.txt"
+    apart.write_text("\n".join(edges_of(found.levelled)))
+    extra.append(f"--geometry.remove.keep-edges.input-file={apart}")
     types = ",".join(str(_sumo_home() / "data" / "typemap" / name) for name in TYPES)
     net = _netconvert(
         folder, "full.net.xml", ["--osm-files", str(file.path), "--type-files", types, *OSM_OPTIONS, *extra]

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
+from sumo_nets.maps.levels import settle_levels
 from sumo_nets.maps.sidewalks import STREET_WIDTHS_M
 from sumo_nets.maps.signalcheck import lengthen_walks, mend_signals
 
@@ -27,5 +28,5 @@ class Rules:
 
 SUITE_RULES: Final = Rules(3, {}, (mend_signals,))
 """The version that imports the SUMO nets of the shipped places: the suites hold the hashes of these nets."""
-NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (mend_signals, lengthen_walks))
+NEWEST_RULES: Final = Rules(4, STREET_WIDTHS_M, (settle_levels, mend_signals, lengthen_walks))
 """The version that imports everything else."""

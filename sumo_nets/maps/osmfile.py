@@ -16,6 +16,7 @@ from xml.parsers import expat
 import numpy as np
 
 from cosim.core.errors import MapError
+from sumo_nets.maps.levels import is_levelled
 from sumo_nets.maps.rawfile import BLANK, LARGEST_BYTES, head_of, parse, pour, root_of
 
 READABLE = "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can be read"
@@ -46,6 +47,7 @@ class OsmFacts:
     roads, ways_on_foot: counts of highway ways.
     tagged: ids of roads whose tags speak of their sidewalks.
     widths: tags of roads that give widths of their sidewalks, by the roads' ids.
+    levelled: numbers of nodes of the streets and paths that may not be on the ground, by their ids.
     """
 
     nodes: int
@@ -55,6 +57,7 @@ class OsmFacts:
     centre: tuple[float, float]
     tagged: frozenset[str]
     widths: Mapping[str, Mapping[str, str]]
+    levelled: Mapping[str, int]
     licence: str
 
 
@@ -124,15 +127,19 @@ class _Scan:
     on_foot: int = 0
     tagged: set[str] = field(default_factory=set)
     widths: dict[str, dict[str, str]] = field(default_factory=dict)
+    levelled: dict[str, int] = field(default_factory=dict)
     head: dict[str, str] = field(default_factory=dict)
     way: str | None = None
+    refs: int = 0
     tags: dict[str, str] = field(default_factory=dict)
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if tag == "node":
             self.lonlat.append(_lonlat(attributes))
         elif tag == "way":
-            self.way, self.tags = attributes["id"], {}
+            self.way, self.refs, self.tags = attributes["id"], 0, {}
+        elif tag == "nd":
+            self.refs += 1
         elif tag == "tag" and self.way is not None:
             self.tags[attributes.get("k", "")] = attributes.get("v", "")
         elif tag == "osm":
@@ -145,6 +152,8 @@ class _Scan:
         highway = self.tags.get("highway", "")
         if highway:
             _check_numbers(self.way, self.tags)
+            if is_levelled(self.tags):
+                self.levelled[self.way] = self.refs
         if highway in ON_FOOT:
             self.on_foot += 1
         elif highway and highway not in NO_STREET:
@@ -220,5 +229,14 @@ def osm_facts(file: MapFile) -> OsmFacts:
             f"{file.source}: its nodes lie at longitude {lon:g}, latitude {lat:g}: not degrees; reproject it to WGS 84"
         )
     licence = " ".join(scan.head[key] for key in ("copyright", "attribution", "license") if key in scan.head)
-    tagged = frozenset(scan.tagged)
-    return OsmFacts(len(scan.lonlat), scan.ways, scan.roads, scan.on_foot, (lon, lat), tagged, scan.widths, licence)
+    return OsmFacts(
+        nodes=len(scan.lonlat),
+        ways=scan.ways,
+        roads=scan.roads,
+        ways_on_foot=scan.on_foot,
+        centre=(lon, lat),
+        tagged=frozenset(scan.tagged),
+        widths=scan.widths,
+        levelled=scan.levelled,
+        licence=licence,
+    )

@@ -384,6 +384,53 @@ def test_crossings_that_never_have_green_get_a_phase() -> None:
     assert "left as they are" in mend_signals(special)[0] and walks_of(special).never == [":J_c0"]
 
 
+def with_ways(ways: dict[str, tuple[list[tuple[float, float]], dict[str, str]]]) -> str:
+    """The town of `osm` with further ways: places in blocks east and north of its corner, and tags."""
+    (lon, lat), nodes, rows = BERLIN, list[str](), list[str]()
+    number = {(float(i), float(k)): 1 + 4 * i + k for i in range(4) for k in range(4)}
+    for way, (points, tags) in ways.items():
+        for x, y in points:
+            if (x, y) not in number:
+                number[x, y] = 1000 + len(number)
+                nodes.append(f'<node id="{number[x, y]}" lon="{lon + 0.0017 * x:.7f}" lat="{lat + 0.0011 * y:.7f}"/>')
+        refs = "".join(f'<nd ref="{number[point]}"/>' for point in points)
+        rows.append(f'<way id="{way}">{refs}{"".join(f"<tag k={k!r} v={v!r}/>" for k, v in tags.items())}</way>')
+    # netconvert reads no nodes after the first way.
+    town = osm().replace("<node", "".join(nodes) + "<node", 1)
+    return town.replace("</osm>", "\n".join(rows) + "</osm>")
+
+
+@pytest.mark.engine
+def test_a_layer_alone_closes_no_sidewalk(tmp_path: Path) -> None:
+    """A layer counts with a bridge, a tunnel, a roof or a street over or under it; level and location count alone.
+
+    A bridge closes its own part of a street, not the streets before and after it.
+    """
+    street = {"highway": "residential", "sidewalk": "both"}
+    text = with_ways(
+        {
+            "400": ([(3.0, 0.0), (4.0, 0.0)], street | {"layer": "1"}),
+            "401": ([(4.0, 0.0), (4.3, 0.0)], street | {"bridge": "yes", "layer": "1"}),
+            "402": ([(4.3, 0.0), (5.0, 0.0)], street),
+            "403": ([(0.0, 3.0), (0.0, 4.0), (0.5, 4.5)], {"highway": "footway", "layer": "1"}),
+            "404": ([(1.0, 3.0), (1.5, 3.4), (1.5, 2.5)], {"highway": "footway", "layer": "-1"}),
+            "405": ([(2.0, 3.0), (2.0, 4.0)], {"highway": "footway", "layer": "-1", "covered": "yes"}),
+            "406": ([(3.0, 3.0), (3.0, 4.0)], {"highway": "footway", "level": "-2"}),
+            "407": ([(3.0, 2.0), (4.0, 2.0)], {"highway": "footway", "covered": "yes", "level": "0;1"}),
+        }
+    )
+    about = import_map(written(tmp_path / "levels.osm", text))
+    going = {name.lstrip("-").split("#")[0]: s.going for name, s in read_map("levels").strips.items() if name[0] != ":"}
+    assert {way: going[way] for way in map(str, range(400, 408))} == {
+        "400": "plain", "401": "bridge", "402": "plain", "403": "plain",
+        "404": "bridge", "405": "bridge", "406": "bridge", "407": "plain",
+    }  # fmt: skip
+    assert (
+        "3 walkways with a layer are on the ground: no bridge, no tunnel, no street over or under them" in about.changes
+    )
+    assert any(change.startswith("1 walkways are above or below the ground by their level") for change in about.changes)
+
+
 def test_greens_too_short_to_walk_are_lengthened() -> None:
     """Each green lasts as long as the crossing takes; no state changes, so nothing goes together that did not before.
 

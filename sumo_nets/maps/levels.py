@@ -1,0 +1,136 @@
+"""Streets above and below the ground: which ones they are, as far as tags and geometry show.
+
+OpenStreetMap's `layer` orders what lies over what and is often set on whole streets. Alone it is no evidence.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import shapely
+
+from sumo_nets.net.netfacts import footway
+from sumo_nets.net.netfile import GROUND, LANE_M
+
+LEVEL_KEYS: Final = ("bridge", "tunnel", "layer", "covered", "location", "level")
+"""Tags of OSM ways that can say that a way is not on the ground."""
+_GROUND_LAYERS: Final = ("", "0")
+_MOSTLY: Final = 0.5
+"""A walkway with more of its area than this on roads of another layer lies over or under them."""
+
+
+def is_levelled(tags: Mapping[str, str]) -> bool:
+    """Return whether tags of an OSM way may say that it is not on the ground."""
+    raised = any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel"))
+    return raised or tags.get("layer", "0") not in _GROUND_LAYERS or _elsewhere(tags)
+
+
+def edges_of(ways: Mapping[str, int]) -> Iterator[str]:
+    """Yield the ids that netconvert may give the edges of OSM ways. ways: their numbers of nodes by their ids."""
+    for way, nodes in ways.items():
+        for name in (way, *(f"{way}#{part}" for part in range(nodes - 1))):
+            yield name
+            yield f"-{name}"
+
+
+def settle_levels(root: ET.Element) -> list[str]:
+    """Decide, in place, which edges are not on the ground. Return what was changed, a sentence each.
+
+    Bridges and tunnels stay as they are. An edge with a level or location off the ground gets a layer. An edge with a
+    layer keeps it if it is covered, or if it lies over or under a street of another layer; else it is on the ground.
+    """
+    normal = [edge for edge in root.iter("edge") if not edge.get("function") and len(edge.findall("lane"))]
+    said = {edge.get("id", ""): _params(edge) for edge in normal}
+    moved, doubtful = 0, list[ET.Element]()
+    for edge in normal:
+        tags = said[edge.get("id", "")]
+        if any(tags.get(key, "no") not in GROUND for key in ("bridge", "tunnel")):
+            continue
+        if _elsewhere(tags):
+            if tags.get("layer", "0") in _GROUND_LAYERS:
+                _set_layer(edge, "-1" if tags.get("level", "-1").startswith("-") else "1")
+            moved += footway(edge) is not None
+        elif tags.get("layer", "0") not in _GROUND_LAYERS and tags.get("covered", "no") == "no":
+            doubtful.append(edge)
+    stacked = _stacked(doubtful, normal, said)
+    settled = [edge for edge in doubtful if edge.get("id") not in stacked]
+    for edge in settled:
+        _set_layer(edge, None)
+    walked = sum(footway(edge) is not None for edge in settled)
+    changes = []
+    if moved:
+        changes.append(f"{moved} walkways are above or below the ground by their level or location: routes avoid them")
+    if walked:
+        changes.append(
+            f"{walked} walkways with a layer are on the ground: no bridge, no tunnel, no street over or under them"
+        )
+    return changes
+
+
+def _params(edge: ET.Element) -> dict[str, str]:
+    return {param.get("key", ""): param.get("value", "") for param in edge.findall("param")}
+
+
+def _set_layer(edge: ET.Element, layer: str | None) -> None:
+    for param in edge.findall("param"):
+        if param.get("key") == "layer":
+            edge.remove(param)
+    if layer is not None:
+        ET.SubElement(edge, "param", {"key": "layer", "value": layer})
+
+
+def _elsewhere(tags: Mapping[str, str]) -> bool:
+    """Whether level or location say that a way is on another storey than the ground's."""
+    if tags.get("location") in ("underground", "overhead"):
+        return True
+    try:
+        levels = [float(part) for part in tags.get("level", "0").split(";")]
+    except ValueError:
+        return False
+    return all(level > 0.0 for level in levels) or all(level < 0.0 for level in levels)
+
+
+def _stacked(doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping[str, Mapping[str, str]]) -> set[str]:
+    """The ids of those edges that cross a street of another layer, or lie mostly over or under such streets."""
+    others = [edge for edge in normal if any(lane.get("allow") != "pedestrian" for lane in edge.findall("lane"))]
+    if not doubtful or not others:
+        return set()
+    lines = [_line(edge.findall("lane")[-1]) for edge in others]
+    tree, found = shapely.STRtree(lines), set[str]()
+    roads = shapely.STRtree([_ground(edge) for edge in others])
+    for edge in doubtful:
+        name, ends = edge.get("id", ""), {edge.get("from"), edge.get("to")}
+        layer, line, ground = said[name]["layer"], _line(edge.findall("lane")[0]), _ground(edge)
+        crossed = [others[k] for k in tree.query(line, predicate="crosses")]
+        touched = [(others[k], roads.geometries[k]) for k in roads.query(ground, predicate="intersects")]
+        # Streets that meet at a junction may overlap there.
+        under = [
+            area
+            for other, area in touched
+            if _layer(said[other.get("id", "")]) != layer and not ends & {other.get("from"), other.get("to")}
+        ]
+        hidden = shapely.area(shapely.intersection(shapely.union_all(under), ground)) / shapely.area(ground)
+        if hidden > _MOSTLY or any(_layer(said[other.get("id", "")]) != layer for other in crossed):
+            found.add(name)
+    return found
+
+
+def _layer(tags: Mapping[str, str]) -> str:
+    """The layer of an edge; a bridge or tunnel without one is on a layer of its own."""
+    for key in ("bridge", "tunnel"):
+        if tags.get(key, "no") not in GROUND:
+            return tags.get("layer", key)
+    return tags.get("layer", "0")
+
+
+def _line(lane: ET.Element) -> shapely.LineString:
+    points = [[float(v) for v in point.split(",")[:2]] for point in lane.get("shape", "").split()]
+    return shapely.LineString(points)
+
+
+def _ground(edge: ET.Element) -> shapely.Geometry:
+    """The ground that an edge covers."""
+    lanes = [(_line(lane), float(lane.get("width", LANE_M))) for lane in edge.findall("lane")]
+    return shapely.union_all([shapely.buffer(line, width_m / 2.0, cap_style="flat") for line, width_m in lanes])
