@@ -111,8 +111,10 @@ def _stacked(doubtful: list[ET.Element], normal: list[ET.Element], said: Mapping
             for other, area in touched
             if _layer(said[other.get("id", "")]) != layer and not ends & {other.get("from"), other.get("to")}
         ]
-        hidden = shapely.area(shapely.intersection(shapely.union_all(under), ground)) / shapely.area(ground)
-        if hidden > _MOSTLY or any(_layer(said[other.get("id", "")]) != layer for other in crossed):
+        hidden_m2 = shapely.area(shapely.intersection(shapely.union_all(under), ground))
+        if hidden_m2 > _MOSTLY * shapely.area(ground) or any(
+            _layer(said[other.get("id", "")]) != layer for other in crossed
+        ):
             found.add(name)
     return found
 
