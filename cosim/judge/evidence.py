@@ -17,7 +17,7 @@ from cosim.core.geometry import Floats, Polyline
 from cosim.episode.in_flight import median_ms
 from cosim.episode.log import Log
 from cosim.episode.loop import ROUTE_WINDOW_M
-from cosim.judge.referee import STOP_S, FreezeWindow, at_goal
+from cosim.judge.referee import STOP_S, FreezeWindow, at_goal, is_round, near_goal
 from cosim.people.yielding import ROBOT_STANDS_MPS
 from cosim.records.record import Ended, Record
 from cosim.spec.scenario import Scenario
@@ -136,7 +136,8 @@ def _freezings(record: Record, scenario: Scenario, log: Log) -> Iterator[Contrad
 
 
 def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
-    """The ends that the trajectory allows; one that is over before its last tick has none."""
+    """The ends that the trajectory allows; one that is over before its last tick has none. Only the map
+    tells whether one can walk straight on to a goal that is near."""
     last = len(log) - 1
     late = last + 1 >= Clock().ticks(scenario.time_limit_s)
     if any(failure.tick == last for failure in record.failures):
@@ -150,7 +151,8 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
     goals[[failure.tick for failure in record.failures]] = False
     if goals.any():
         return ["goal"] if int(np.argmax(goals)) == last else []
-    return ["timeout"] if late else []
+    near = bool(near_goal(scenario, log.pose[-1:]).any()) and not is_round(scenario)
+    return [*(["goal"] if near else []), *(["timeout"] if late else [])]
 
 
 def _before(values: Floats, first: float) -> Floats:

@@ -13,6 +13,9 @@ Rules (the paper leaves them open; each is a decision of this benchmark):
   nothing but its time.
 - Signals are judged on the crossings of the reference route, by arc length.
 - Failures of one kind a tick: collisions before out_of_lane before freezing; one reset for all of them.
+- The goal is reached within its radius, at the end of the route; or wherever the arc length is, from where one can walk
+  straight on to the goal: a part of the route was skipped on foot. Where the route itself passes that near before its
+  end, a round, its end alone counts.
 - Where an episode ends at a stop (`gesturing`): stopped within 3 m in front of the pedestrian for 2 s ends it well,
   passing the pedestrian ends it badly.
 - After a failure the robot is put at the nearest free waypoint of the route (every 5 m, never on a crossing, at an
@@ -38,6 +41,7 @@ from cosim.core.geometry import Circle, Floats, Pose, box_disk_gap, boxes_overla
 from cosim.core.state import PERSON_RADIUS_M, STILL, Contact, Signal
 from cosim.episode.step import Reset, Step
 from cosim.people.yielding import ROBOT_STANDS_MPS, STOOD_S, outline_mps
+from cosim.place.fences import outline
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventState
 from cosim.spec.obstacle import footprint
@@ -64,6 +68,8 @@ RED_WAIT_M = 4.0
 STOP_S = 2.0
 STOP_WITHIN_M = 3.0
 """Before a stopping hand: slower than STANDING_MPS for STOP_S, the base centre at most so far in front of it."""
+ROUND_M = 0.5
+"""A route is a round where it passes its goal, before its end, within the goal's radius and this."""
 LEFT_M = 0.3
 """A robot this far before a crossing has left it and may enter it anew."""
 
@@ -109,6 +115,8 @@ class Referee:
         self._clock = clock
         self._route = scenario.route_line
         self._obstacles = shapely.union_all([footprint(obstacle) for obstacle in scenario.obstacles])
+        self._fences = shapely.union_all([outline(barrier) for barrier in scenario.barriers])
+        self._is_round = is_round(scenario)
         self._limit_ticks = clock.ticks(scenario.time_limit_s)
         self._touching: dict[str, int] = {}
         self._walked_into: set[str] = set()
@@ -142,9 +150,16 @@ class Referee:
         if self._scenario.ends_at == "stop":
             return self._end_by_stop(step)
         pose = step.motion.robot.pose
-        if at_goal(self._scenario, np.array([pose]), np.array([step.route_s_after_m])).any():
+        if at_goal(self._scenario, np.array([pose]), np.array([step.route_s_after_m])).any() or self._walks_in(pose):
             return "goal"
         return "timeout" if step.tick + 1 >= self._limit_ticks else None
+
+    def _walks_in(self, pose: Pose) -> bool:
+        """Whether the goal is near and straight ahead on walkable ground, by whatever way the robot came."""
+        if self._is_round or not near_goal(self._scenario, np.array([pose])).any():
+            return False
+        straight = shapely.LineString([pose.xy, self._scenario.goal])
+        return bool(shapely.covers(self._area.polygon, straight)) and not shapely.intersects(self._fences, straight)
 
     def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:
         """The episode of a gesturing pedestrian: over when the robot has stopped before it, or has passed it."""
@@ -304,11 +319,25 @@ class FreezeWindow:
 
 
 def at_goal(scenario: Scenario, pose: Floats, route_s_m: Floats) -> NDArray[np.bool_]:
-    """(T,) at which of (T, 3) poses with these arc lengths (T,) the goal is reached."""
-    away_m = np.hypot(pose[:, 0] - scenario.goal[0], pose[:, 1] - scenario.goal[1])
+    """(T,) at which of (T, 3) poses with these arc lengths (T,) the goal is reached at the end of the route."""
     last_m = scenario.route_line.length_m - 2 * scenario.goal_radius_m
-    reached: NDArray[np.bool_] = (away_m <= scenario.goal_radius_m) & (route_s_m >= last_m)
+    reached: NDArray[np.bool_] = near_goal(scenario, pose) & (route_s_m >= last_m)
     return reached
+
+
+def near_goal(scenario: Scenario, pose: Floats) -> NDArray[np.bool_]:
+    """(T,) which of (T, 3) poses are within the goal's radius."""
+    away_m = np.hypot(pose[:, 0] - scenario.goal[0], pose[:, 1] - scenario.goal[1])
+    near: NDArray[np.bool_] = away_m <= scenario.goal_radius_m
+    return near
+
+
+def is_round(scenario: Scenario) -> bool:
+    """Whether a route passes its own goal before its end, so that being there does not say that it was driven."""
+    route = scenario.route_line
+    last_m = route.length_m - 2 * scenario.goal_radius_m
+    before = shapely.LineString([*route.points[route.s_m < last_m], route.at(last_m).xy])
+    return before.distance(shapely.Point(scenario.goal)) <= scenario.goal_radius_m + ROUND_M
 
 
 def stands_before(robot: Pose, event: Event, state: EventState) -> bool:

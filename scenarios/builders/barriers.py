@@ -1,9 +1,10 @@
-"""Closing every branch of a way with barriers, and the proof that exactly one walkable path remains."""
+"""Closing every branch of a way with barriers, and the proof that exactly one walkable path remains: the way itself."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from typing import Final
 
 import numpy as np
 import shapely
@@ -12,7 +13,8 @@ from shapely.geometry import LineString, MultiPolygon, Point, Polygon
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
-from cosim.place.street_map import Port, StreetMap, union_closed
+from cosim.place.fences import fenced
+from cosim.place.street_map import SEAM_M, Port, StreetMap, union_closed
 from cosim.spec.scenario import Barrier
 
 INTO_STRIP_M = 0.5
@@ -28,6 +30,13 @@ MOUTH_M = 4.0
 
 _REACH_M = 30.0
 """The walkable area is examined this far around the way; what can be reached must end before."""
+
+BACK_M: Final = 5.0
+"""Nowhere does a route lead back towards its start by more than this. Measured: at most 0.4 m on the 105 shipped routes
+and 2.5 m on 400 more, but for seven that double back, by 11 to 69 m."""
+_SPOT_M: Final = 2.0
+_SIGHT_M: Final = 30.0
+"""Walks are put together from straight lines between spots of the route so far from each other, at most."""
 
 
 def branches(street_map: StreetMap, way: Sequence[Port]) -> list[Port]:
@@ -101,28 +110,6 @@ def mouth(end: Floats, along: Floats, reach_m: float, corner: Polygon | MultiPol
     return end if met.is_empty else inside - met.distance(Point(inside)) * along
 
 
-def outline(barrier: Barrier, margin_m: float = 0.0) -> Polygon:
-    """The ground that a barrier covers, grown by a margin."""
-    cos, sin = math.cos(barrier.heading_rad), math.sin(barrier.heading_rad)
-    half = barrier.length_m / 2
-    line = LineString(
-        [
-            (barrier.x_m - half * sin, barrier.y_m + half * cos),
-            (barrier.x_m + half * sin, barrier.y_m - half * cos),
-        ]
-    )
-    return shapely.buffer(line, barrier.thickness_m / 2 + margin_m, cap_style="flat")
-
-
-def fenced(area: Polygon | MultiPolygon, barriers: Iterable[Barrier]) -> Polygon | MultiPolygon:
-    """The walkable area minus the ground of the barriers."""
-    fences = [outline(barrier) for barrier in barriers]
-    if not fences:
-        return area
-    left: Polygon | MultiPolygon = overlay.difference(area, overlay.union_all(fences))
-    return left
-
-
 def prove_single_path(
     street_map: StreetMap,
     route: Polyline,
@@ -136,8 +123,8 @@ def prove_single_path(
     What is shown, on the walkable polygon itself: (1) the part of walkable-minus-barriers that holds the start holds
     the goal; (2) it ends within REACH_M of the way, so nothing leads elsewhere; (3) it has no hole, and in an area
     without holes all paths between two points are the same but for bending; (4) start and goal stay connected when
-    the area is eroded by half the robot's width, so the robot fits through. ground: what `ground_around` gives, where
-    it is known.
+    the area is eroded by half the robot's width, so the robot fits through; (5) no shorter walk skips a part of the
+    route. ground: what `ground_around` gives, where it is known.
     """
     surroundings, walkable = ground_around(street_map, route, way) if ground is None else ground
     free = fenced(walkable, barriers)
@@ -156,7 +143,39 @@ def prove_single_path(
         raise SpecError(f"somewhere the way is narrower than {2 * half_width_m:.2f} m")
     if not passable.covers(LineString(route.points)):
         raise SpecError(f"the route comes nearer than {half_width_m:.2f} m to the edge of the walkable area")
+    _refuse_doubling_back(part, route)
     return part
+
+
+def _refuse_doubling_back(part: Polygon, route: Polyline) -> None:
+    """Raises SpecError where the walk from the start of a route to a place on it is shorter, by more than BACK_M, than
+    the walk to an earlier place: out along one strip and back along another one that touches it."""
+    spots = route.resampled(_SPOT_M)
+    walk_m = _walks_m(part, spots.points)
+    back_m = np.maximum.accumulate(walk_m) - walk_m
+    if back_m.max() > BACK_M:
+        worst = int(back_m.argmax())
+        before = int(walk_m[:worst].argmax())
+        raise SpecError(
+            f"the way doubles back: its start is {back_m[worst]:.0f} m nearer on foot {spots.s_m[worst]:.0f} m along "
+            f"it than {spots.s_m[before]:.0f} m along it"
+        )
+
+
+def _walks_m(area: Polygon, spots: Floats) -> Floats:
+    """(N,) m: from the first of (N, 2) spots of a line to each, by straight lines between spots inside an area."""
+    from scipy.sparse import csr_array  # 0.2 s, and episodes have their routes
+    from scipy.sparse.csgraph import dijkstra
+
+    i, j = np.triu_indices(len(spots), 1)
+    apart_m = np.hypot(*(spots[i] - spots[j]).T)
+    i, j, apart_m = (values[apart_m <= _SIGHT_M] for values in (i, j, apart_m))
+    grown = shapely.buffer(area, SEAM_M)
+    shapely.prepare(grown)
+    seen = (j == i + 1) | shapely.covers(grown, shapely.linestrings(np.stack([spots[i], spots[j]], axis=1)))
+    graph = csr_array((apart_m[seen], (i[seen], j[seen])), shape=(len(spots), len(spots)))
+    found: Floats = dijkstra(graph, directed=False, indices=0)  # type: ignore[call-overload]
+    return found
 
 
 def ground_around(

@@ -16,13 +16,13 @@ from shapely.geometry import LineString, Point
 
 from cosim.core.errors import MachineError, MapError, SpecError, UsageError
 from cosim.core.telling import Tell, untold
+from cosim.place.fences import outline
 from cosim.place.street_map import StreetMap, WalkableArea
 from cosim.spec.obstacle import footprint
 from cosim.spec.robot import ROBOTS, robot_called
 from cosim.spec.scenario import MOST_PERSONS, Place, RouteCrossing, Scenario, Suite, event_faults
 from cosim.spec.spec_file import in_lines
 from physics.cameras.hdri import read_hdri
-from scenarios.builders.barriers import outline
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.crowd.room import Room

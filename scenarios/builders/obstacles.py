@@ -21,6 +21,7 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.judge.referee import FREE_OF_OBSTACLES_M, WAYPOINT_STEP_M
 from cosim.place import overlay
+from cosim.place.fences import fenced, outline
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.obstacle import OBSTACLE_FORMS, OBSTACLE_VARIANTS, Obstacle, ObstacleKind, footprint, obstacle_size_m
 from cosim.spec.robot import Robot, robot_called
@@ -28,7 +29,6 @@ from cosim.spec.scenario import Scenario
 from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
 from physics.world.street_surface import StreetSurface
-from scenarios.builders.barriers import fenced, outline
 
 PER_100M: Final = (4.0, 8.0)
 """Obstacles along 100 m of sidewalk, fewest and most: each scenario draws its own density. The fences of a construction

@@ -23,6 +23,7 @@ from cosim.episode.observing import Observer
 from cosim.episode.ports import Camera, CameraSpec, Director, Eyes, Manifest, Privileged
 from cosim.people.standing import Standing, standing_bodies
 from cosim.place import overlay
+from cosim.place.fences import fenced
 from cosim.place.street_map import Port, StreetMap, WalkableArea
 from cosim.records.record import NO_RENDERER
 from cosim.spec.event_kind import EventKinds
@@ -35,7 +36,6 @@ from physics.cameras.choice import camera_of, camera_of_choice, renderer_of
 from physics.street.furniture import Prop, footprints
 from physics.world.surface import Surface
 from physics.world.world import BulletWorld
-from scenarios.builders.barriers import fenced
 from scenarios.execution.directing import AmongObstacles, director_of
 from scenarios.execution.injected import InjectedPeople
 from scenarios.execution.places import place, surface_of_place

@@ -24,6 +24,7 @@ from shapely.geometry import LineString
 from cosim.core.geometry import Floats, Polyline
 from cosim.core.state import PERSON_RADIUS_M
 from cosim.place import overlay
+from cosim.place.fences import outline
 from cosim.place.street_map import Corner, Lane, StreetMap, Strip, union_closed
 from cosim.spec.obstacle import Obstacle, footprint
 from cosim.spec.scenario import Barrier
@@ -32,7 +33,6 @@ from physics.street.interaction_spots import InteractionSpot, What, spots
 from physics.street.placement import CLEAR_HALF_M
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import key_at
-from scenarios.builders.barriers import outline
 
 _REACH_M: Final = 55.0
 """The graph covers the sidewalks this near to the route."""

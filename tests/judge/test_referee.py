@@ -29,7 +29,7 @@ from cosim.judge.referee import FREE_OF_OBSTACLES_M, Referee, Verdict
 from cosim.place.street_map import WalkableArea
 from cosim.spec.events import Event, EventReply, EventState, Walker
 from cosim.spec.obstacle import Obstacle
-from cosim.spec.scenario import City, RouteCrossing, Scenario
+from cosim.spec.scenario import Barrier, City, RouteCrossing, Scenario
 
 CLOCK = Clock()
 AREA = WalkableArea(box(-5, -2, 105, 2))
@@ -338,6 +338,30 @@ def test_a_goal_near_the_start_of_a_round_route_counts_only_at_its_end() -> None
     loop = ((0.0, 0.0), (50.0, 0.0), (50.0, 1.0), (0.5, 1.0))
     one = referee(route=loop, goal=(0.5, 1.0))
     assert one.judge(step(0, 0.5, 0.4)).ended is None
+
+
+HAIRPIN = {"route": ((0.0, -1.0), (50.0, -1.0), (50.0, 1.0), (0.0, 1.0)), "goal": (0.0, 1.0), "start": (0.0, -1.0, 0.0)}
+
+
+@pytest.mark.parametrize(
+    ("y_m", "more", "ended"),
+    [
+        (0.2, {}, "goal"),
+        (-0.2, {}, None),
+        (0.2, {"barriers": (Barrier(x_m=0.0, y_m=0.5, heading_rad=1.5708, length_m=9.0, strip="s", end=0),)}, None),
+        (0.2, {"barriers": (Barrier(x_m=9.0, y_m=0.5, heading_rad=1.5708, length_m=9.0, strip="s", end=0),)}, "goal"),
+    ],
+    ids=["at it", "too far", "behind a fence", "beside a fence"],
+)
+def test_a_robot_at_the_goal_is_there_though_it_skipped_a_part_of_the_route(
+    y_m: float, more: dict[str, object], ended: str | None
+) -> None:
+    """A route leads out and back along two strips that touch: whoever walks across is at the goal, by no arc length."""
+    one = Referee(scenario(**HAIRPIN | more), AREA, (0.7, 0.55), CLOCK)
+    across = step(0, 0.3, y_m)
+    assert one.judge(across).ended == ended
+    apart = WalkableArea(AREA.polygon.difference(box(-5, 0.4, 55, 0.5)))
+    assert Referee(scenario(**HAIRPIN | more), apart, (0.7, 0.55), CLOCK).judge(across).ended is None
 
 
 @pytest.mark.parametrize("kind", ["vehicle", "wall", "object"])

@@ -11,11 +11,12 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Polyline
+from cosim.place.fences import outline
 from cosim.place.street_map import Port, StreetMap, Strip
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, content_hash
 from scenarios.builders import long_horizon
-from scenarios.builders.barriers import barrier_at, branches, outline, prove_single_path
+from scenarios.builders.barriers import barrier_at, branches, prove_single_path
 from scenarios.builders.hems import MOST, hem
 from scenarios.builders.recipes import RECIPES, candidate
 from scenarios.catalog import load_suite

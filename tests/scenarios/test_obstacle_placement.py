@@ -13,6 +13,7 @@ from shapely.geometry import LineString, Point
 
 from cosim.core.errors import SpecError
 from cosim.core.state import PERSON_RADIUS_M, RobotState
+from cosim.place.fences import fenced, outline
 from cosim.place.street_map import StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import EventReply
@@ -23,7 +24,6 @@ from physics.street.furniture import footprints
 from physics.street.placement import driveway_ground
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import keys_in
-from scenarios.builders.barriers import fenced, outline
 from scenarios.builders.long_horizon import build_long_horizon
 from scenarios.builders.obstacles import (
     BESIDE_FREE_M,

@@ -21,6 +21,7 @@ from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats, Polyline, wrap_angle
 from cosim.core.state import NOBODY, PERSON_RADIUS_M, People, PersonKind
 from cosim.people.gait import Strides
+from cosim.place.fences import outline
 from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.spec.events import EventQuery, EventReply
 from cosim.spec.scenario import Barrier, City, CrowdSpec, Scenario
@@ -31,7 +32,6 @@ from physics.street.interaction_spots import spots
 from physics.street.placement import CLEAR_HALF_M
 from physics.world.street_surface import StreetSurface
 from physics.world.tiles import key_at
-from scenarios.builders.barriers import outline
 from scenarios.catalog import load_suite, with_crowd
 from scenarios.residents.director import GONE_M, WITHIN_M, Residents
 from scenarios.residents.graph import OFF_WALK_M, BehaviorGraph, behavior_graph

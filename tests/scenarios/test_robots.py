@@ -20,6 +20,7 @@ from cosim.core.state import NO_VEHICLES, NOBODY, Command, People, RobotState, S
 from cosim.episode.control import command_of
 from cosim.episode.driver import Driver
 from cosim.episode.ports import CameraSpec, Manifest, Observation, Privileged, WaypointRule
+from cosim.place.fences import fenced
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.policies.body import BodyDisks
@@ -39,7 +40,6 @@ from physics.cameras.view import robot_shot
 from physics.robots import hash_of_robot, urdf_of
 from physics.world.drive import SkidDrive
 from physics.world.street_surface import StreetSurface
-from scenarios.builders.barriers import fenced
 from scenarios.builders.fits import misfits
 from scenarios.catalog import load_suite, with_robot
 from scenarios.checks import small_scenario

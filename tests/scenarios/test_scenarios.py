@@ -19,6 +19,8 @@ from cosim.core.state import NO_VEHICLES, NOBODY, RobotState, Street
 from cosim.episode.driver import Driver
 from cosim.episode.loop import Moment, query
 from cosim.episode.ports import Privileged
+from cosim.place.fences import fenced
+from cosim.place.route_line import way_line
 from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, WalkableArea
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
@@ -26,7 +28,7 @@ from cosim.spec.events import Event, EventQuery
 from cosim.spec.robot import ROBOTS, Robot
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from cosim.spec.selection import scenarios_chosen
-from scenarios.builders.barriers import barrier_at, branches, fenced, prove_single_path
+from scenarios.builders.barriers import barrier_at, branches, prove_single_path
 from scenarios.builders.drawing import thinned
 from scenarios.builders.long_horizon import build_long_horizon, on_road_m
 from scenarios.builders.proofs import read_proofs
@@ -232,6 +234,28 @@ def test_the_proof_refuses_a_way_round_an_island() -> None:
     fences = [barrier_at(street_map, port) for port in branches(street_map, way)]
     with pytest.raises(SpecError, match=r"two ways remain: they lead round \(0\.1, 0\.1\)"):
         prove_single_path(street_map, Polyline([(-30, 0), (30, 0)]), fences, way, 0.2)
+
+
+def test_the_proof_refuses_a_way_that_doubles_back() -> None:
+    """Out on one of two sidewalks that touch and back on the other: whoever walks straight across skips the loop. With
+    a gap between them there is no way across."""
+
+    def beside(apart_m: float) -> StreetMap:
+        """Two sidewalks of 60 m and 2 m of width, so far apart, joined in the east."""
+        lines = {"out": np.array([[0.0, 0.0], [60.0, 0.0]]), "back": np.array([[0.0, 2.0], [60.0, 2.0]])}
+        lines["back"][:, 1] += apart_m
+        strips = {
+            name: Strip(name, "sidewalk", line, 2.0, LineString(line).buffer(1.0, cap_style="flat"), (None, "end"))
+            for name, line in lines.items()
+        }
+        corner = Corner("end", box(60, -1, 63, 3 + apart_m), (Port("out", 1), Port("back", 1)))
+        return StreetMap("beside", (0, -1, 63, 3 + apart_m), strips, {"end": corner}, {}, {})
+
+    way = [Port("out", 1), Port("back", 1)]
+    route = way_line(beside(0.0), way, 40.0, 35.0)
+    with pytest.raises(SpecError, match=r"^the way doubles back: its start is \d\d m nearer on foot 7\d m along"):
+        prove_single_path(beside(0.0), route, (), way, 0.3)
+    assert prove_single_path(beside(0.5), way_line(beside(0.5), way, 40.0, 35.0), (), way, 0.3)
 
 
 def test_a_fence_closes_its_whole_strip() -> None:
