@@ -98,7 +98,7 @@ class Corner:
 class Lane:
     """A lane that is not for walking. kind "road": driven on; "verge": between road and sidewalk.
 
-    internal: part of a junction's interior.
+    internal: part of a junction's interior. cars: whether cars may drive on it, and not only bicycles or trams.
     """
 
     id: str
@@ -108,6 +108,7 @@ class Lane:
     width_m: float
     polygon: Polygon
     internal: bool = False
+    cars: bool = True
 
 
 @dataclass(frozen=True, slots=True)

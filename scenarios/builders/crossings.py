@@ -11,9 +11,10 @@ from cosim.core.geometry import Polyline
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
+from cosim.spec.robot import COURIER
 from cosim.spec.scenario import Place, Scenario
 from scenarios.builders.drawing import Refusals, bare_scenario
-from scenarios.builders.long_horizon import on_road_m, route_crossings
+from scenarios.builders.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road_m, route_crossings
 
 START_BEFORE_CROSSING_M: Final = 10.0
 AFTER_M: Final = 8.0
@@ -61,6 +62,8 @@ def _over(place: Place, street_map: StreetMap, graph: WalkGraph, enter: Port, se
     crossings = route_crossings(street_map, route, way[1:])
     if on_road_m(street_map, route, crossings) > OFF_ROAD_M:
         raise MapError("the way lies on a road")
+    if on_car_paths_m(street_map, route, crossings, COURIER) > TURNED_OVER_M:
+        raise MapError("cars turn over the way")
     return bare_scenario(
         route,
         crossings,

@@ -12,6 +12,7 @@ from shapely.geometry import LineString
 
 from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Polyline
+from cosim.place.car_paths import CAR_M, from_car_paths_m
 from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
 from cosim.place.route_line import way_line
 from cosim.place.street_map import Lane, Port, StreetMap
@@ -34,6 +35,12 @@ IN_GROUPS = 0.3
 ON_ROAD_M = 2.0
 """So much of a route may lie on lanes that are driven on, where foreign maps draw sidewalks on the carriageway."""
 
+TURNED_OVER_M = 0.5
+"""So much of a route may lie where cars turn, which foreign maps draw over corners."""
+_KERB_M = 0.5
+"""A crossing's own ground ends so far beyond its line."""
+_SAMPLE_M = 0.5
+
 CROSSING_EVERY_M = 160.0
 LENGTH_SLACK_M = 3.0
 """A way of a wanted length is as long as that, but for this."""
@@ -48,6 +55,8 @@ REMEDIES = {
     "no way of the drawn length": "the walkable pieces are too small or have too few crossings: import a larger area",
     "every long sidewalk": "import another area, or a net with sidewalks beside its roads",
     "the way lies on a road": "its sidewalks are drawn on the carriageway: see `cosim map check MAP -o map.png`",
+    "cars turn over the way": "its corners reach into junctions: see `cosim map check MAP -o map.png`",
+    "the way doubles back": "its sidewalks touch one another: see `cosim map check MAP -o map.png`; import a part",
     "the way would need": "its sidewalks lie over one another: see `cosim map check MAP -o map.png`; import a part",
     "": "see `cosim map check MAP -o map.png` for narrow, torn or stacked sidewalks; another --seed or a part may do",
 }
@@ -132,6 +141,8 @@ def _along(
     crossings = route_crossings(street_map, route, way)
     if on_road_m(street_map, route, crossings) > ON_ROAD_M:
         raise SpecError("the way lies on a road: cars drive through who walks there")
+    if on_car_paths_m(street_map, route, crossings, draft.robot) > TURNED_OVER_M:
+        raise SpecError("cars turn over the way")
     barriers = fences(street_map, route, way, draft.half_width_m)
     bare = bare_scenario(
         route,
@@ -283,3 +294,13 @@ def on_road_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteC
         if lane.kind == "road" and not lane.internal:
             on_road |= shapely.contains_xy(lane.polygon, x, y)
     return float(on_road.sum())
+
+
+def on_car_paths_m(street_map: StreetMap, route: Polyline, crossings: Sequence[RouteCrossing], robot: Robot) -> float:
+    """Metres of a route on which a robot is in the way of cars inside a junction, crossings apart."""
+    s_m = np.arange(0.5 * _SAMPLE_M, route.length_m, _SAMPLE_M)
+    for crossing in crossings:
+        s_m = s_m[(s_m < crossing.enter_s_m - _KERB_M) | (s_m > crossing.leave_s_m + _KERB_M)]
+    xy = np.column_stack([np.interp(s_m, route.s_m, route.points[:, k]) for k in (0, 1)])
+    hit = from_car_paths_m(street_map, xy) < 0.5 * (CAR_M + robot.width_m)
+    return _SAMPLE_M * float(hit.sum())

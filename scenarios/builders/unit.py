@@ -21,7 +21,7 @@ from cosim.spec.event_kind import SidewalkLayout
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
 from scenarios.builders.drawing import TRIES, Refusals, bare_scenario, first_of
-from scenarios.builders.long_horizon import on_road_m
+from scenarios.builders.long_horizon import TURNED_OVER_M, on_car_paths_m, on_road_m
 from scenarios.builders.obstacles import with_obstacles
 from scenarios.builders.reactive import LIMIT_S, NO_CROWD, along_sidewalk, over_crossing
 
@@ -73,6 +73,8 @@ def build_unit(
             raise SpecError("the way is too short or too long")
         if on_road_m(street_map, route, crossings) > _OFF_ROAD_M:
             raise SpecError("the way lies on a road")
+        if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
+            raise SpecError("cars turn over the way")
         bare = bare_scenario(
             route,
             crossings,

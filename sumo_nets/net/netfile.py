@@ -180,6 +180,7 @@ def _street_map(path: Path, raw: _Raw, net_hash: str) -> StreetMap:
             width_m=float(widths[k]),
             polygon=polygons[k],
             internal=edge.attributes.get("function", "") == "internal",
+            cars=_allows(lane, "passenger"),
         )
         for k, (edge, lane, kind) in enumerate(driven, len(walk))
     }

@@ -1,0 +1,55 @@
+"""Where cars turn: the paths inside junctions, and the walkable ground beside crossings that they lead over."""
+
+from __future__ import annotations
+
+import numpy as np
+import shapely
+
+from cosim.core.geometry import Floats
+from cosim.place import overlay
+from cosim.place.street_map import Lane, StreetMap, Strip
+
+CAR_M = 2.0
+"""Width of the widest vehicle."""
+_SLIVER_M = 0.5
+"""Ground narrower than this is the rim of a corner, which a car brushes at most."""
+
+
+def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.LineString]:
+    """The middle lines of the paths that cars take inside junctions near an area."""
+    lanes = [lane for lane in street_map.near("lane", area) if isinstance(lane, Lane)]
+    inner = [lane for lane in lanes if lane.internal and lane.cars and lane.kind == "road"]
+    return [shapely.LineString(lane.line[:, :2]) for lane in inner]
+
+
+def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
+    """(N,) m: from (N, 2) points to the nearest middle line on which cars drive inside a junction; inf far from all."""
+    points = shapely.points(xy)
+    lines = paths_near(street_map, shapely.buffer(shapely.MultiPoint(points), 2.0 * CAR_M))
+    far_m = np.full(len(xy), np.inf)
+    if lines:
+        point, _ = (tree := shapely.STRtree(lines)).query(points, predicate="dwithin", distance=2.0 * CAR_M)
+        near = np.unique(point)
+        pairs, gap_m = tree.query_nearest(points[near], return_distance=True, all_matches=False)
+        far_m[near[pairs[0]]] = gap_m
+    return far_m
+
+
+def corners_driven_over(street_map: StreetMap) -> dict[str, shapely.Geometry]:
+    """For each corner that cars drive over: where, crossings apart. In the map's order."""
+    found = {}
+    for name, corner in street_map.corners.items():
+        lines = paths_near(street_map, corner.polygon)
+        if not lines:
+            continue
+        driven = overlay.union_all(shapely.buffer(np.array(lines), CAR_M / 2.0, cap_style="flat").tolist())
+        crossings = [
+            strip.polygon
+            for strip in street_map.near("strip", corner.polygon)
+            if isinstance(strip, Strip) and strip.kind == "crossing"
+        ]
+        ground = overlay.intersection(corner.polygon, driven)
+        ground = overlay.difference(ground, overlay.union_all(crossings)) if crossings else ground
+        if not shapely.is_empty(shapely.buffer(ground, -_SLIVER_M / 2.0)):
+            found[name] = ground
+    return found
