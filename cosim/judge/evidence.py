@@ -145,14 +145,17 @@ def _ends(record: Record, scenario: Scenario, log: Log) -> list[Ended]:
     if scenario.ends_at == "stop":
         stands = np.abs(log.speed[-Clock().ticks(STOP_S) :, 0]).max() < ROBOT_STANDS_MPS
         passed = all(log.route_s_m[last] > event.route_s_m for event in scenario.events)
-        allowed: list[tuple[Ended, bool]] = [("stop", bool(stands)), ("failure", passed), ("timeout", late)]
-        return [ended for ended, may_be in allowed if may_be]
+        return _allowed(("stop", bool(stands)), ("failure", passed), ("timeout", late))
     goals = at_goal(scenario, log.pose, log.route_s_m)
     goals[[failure.tick for failure in record.failures]] = False
     if goals.any():
         return ["goal"] if int(np.argmax(goals)) == last else []
     near = bool(near_goal(scenario, log.pose[-1:]).any()) and not is_round(scenario)
-    return [*(["goal"] if near else []), *(["timeout"] if late else [])]
+    return _allowed(("goal", near), ("timeout", late))
+
+
+def _allowed(*ends: tuple[Ended, bool]) -> list[Ended]:
+    return [ended for ended, allowed in ends if allowed]
 
 
 def _before(values: Floats, first: float) -> Floats:

@@ -177,8 +177,9 @@ class StreetMap:
     elevation: Elevation | None = None
     planned: bool = False
     _trees: dict[str, tuple[shapely.STRtree, tuple[_Piece, ...]]] = field(
-        default_factory=dict, repr=False, compare=False
+        default_factory=dict, init=False, repr=False, compare=False
     )
+    """Made when they are first asked for; a map that is changed makes its own."""
     _made_of: str = field(default="", init=False, repr=False, compare=False)
 
     @property

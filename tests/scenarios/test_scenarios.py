@@ -25,16 +25,19 @@ from cosim.place.street_map import Corner, Lane, Port, StreetMap, Strip, Walkabl
 from cosim.place.walk_graph import WalkGraph
 from cosim.policies import POLICIES
 from cosim.spec.events import Event, EventQuery
-from cosim.spec.robot import ROBOTS, Robot
+from cosim.spec.robot import COURIER, ROBOTS, Robot
 from cosim.spec.scenario import Barrier, City, CityMap, RouteCrossing, Scenario, content_hash, read_suite, write_suite
 from cosim.spec.selection import scenarios_chosen
+from scenarios.builders import long_horizon, unit
 from scenarios.builders.barriers import barrier_at, branches, prove_single_path
 from scenarios.builders.drawing import thinned
-from scenarios.builders.long_horizon import build_long_horizon, on_road_m
+from scenarios.builders.long_horizon import build_long_horizon, on_car_paths_m, on_road_m
 from scenarios.builders.proofs import read_proofs
 from scenarios.builders.sample import suite_on_map
+from scenarios.builders.unit import build_unit
 from scenarios.catalog import SUITES, load_suite
 from scenarios.events import EVENT_KINDS, react
+from scenarios.execution.places import place
 from sumo_nets.maps.mapstore import read_map
 
 LONG = load_suite("long-horizon").scenarios
@@ -169,8 +172,6 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
 @pytest.mark.engine
 def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
     """Start and goal are joined inside the fences, nothing leads round anything, and the route keeps off the edge."""
-    from scenarios.execution.places import place
-
     scenario = shipped
     _, street_map = place(scenario.place)
     route = scenario.route_line
@@ -295,6 +296,44 @@ def test_a_route_on_a_carriageway_is_measured() -> None:
     crossing = RouteCrossing(id="c", enter_s_m=50.0, leave_s_m=60.0, signalised=False)
     assert on_road_m(street_map, route, [crossing]) == pytest.approx(9.0, abs=1.0)
     assert on_road_m(cross_map(), route, ()) == 0.0
+
+
+def turning(street_map: StreetMap, *points: tuple[float, float], cars: bool = True) -> StreetMap:
+    """The map with a path inside a junction."""
+    line = np.array(points)
+    inner = LineString(line).buffer(1.6, cap_style="flat")
+    lane = Lane(f":j{len(street_map.lanes)}", ":j", "road", line, 3.2, inner, internal=True, cars=cars)
+    return dataclasses.replace(street_map, lanes={**street_map.lanes, lane.id: lane})
+
+
+def test_a_route_where_cars_turn_is_measured() -> None:
+    """A path square to a route hits the robot on as much of it as a car and the robot are wide; a path for bicycles
+    does not, nor one over a crossing."""
+    route, across = Polyline([(-30, 0), (38, 0)]), ((0.0, -9.0), (0.0, 9.0))
+    wide_m = COURIER.width_m + 2.0
+    assert on_car_paths_m(turning(cross_map(), *across), route, (), COURIER) == pytest.approx(wide_m, abs=0.5)
+    assert on_car_paths_m(turning(cross_map(), *across, cars=False), route, (), COURIER) == 0.0
+    crossing = RouteCrossing(id="c", enter_s_m=27.0, leave_s_m=33.0, signalised=False)
+    assert on_car_paths_m(turning(cross_map(), *across), route, [crossing], COURIER) == 0.0
+    assert on_car_paths_m(turning(cross_map(), (0.0, 2.0), (0.0, 9.0)), route, (), COURIER) == 0.0
+
+
+@pytest.mark.engine
+def test_routes_keep_off_corners_where_cars_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small city with routes has none left when cars turn over all of every corner, and none round a bend."""
+    for builder, tries in ((long_horizon, 12), (unit, 4)):
+        monkeypatch.setattr(builder, "TRIES", tries)
+    monkeypatch.setattr(long_horizon, "SEARCHES", 3)
+    where = City(seed=2, size_m=500.0)
+    _, street_map = place(where)
+    assert build_long_horizon(where, street_map, WalkGraph(street_map), 0, "plain").crossings
+    for corner in street_map.corners.values():
+        x0, y0, x1, y1 = corner.polygon.bounds
+        street_map = turning(street_map, *((x, y) for y in np.arange(y0, y1 + 2.0, 2.0).tolist() for x in (x0, x1)))
+    with pytest.raises(SpecError, match=r"cars turn over the way \(\d+ times\).*corners reach into junctions"):
+        build_long_horizon(where, street_map, WalkGraph(street_map), 0, "turned-over")
+    with pytest.raises(SpecError, match="cars turn over the way"):
+        build_unit("curve", where, street_map, WalkGraph(street_map), 0, "turned-over")
 
 
 @pytest.mark.engine
