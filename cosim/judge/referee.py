@@ -158,7 +158,7 @@ class Referee:
         """Whether the goal is near and straight ahead on walkable ground, by whatever way the robot came."""
         if self._is_round or not near_goal(self._scenario, np.array([pose])).any():
             return False
-        straight = shapely.LineString([pose.xy, self._scenario.goal])
+        straight = shapely.LineString([(pose.x_m, pose.y_m), self._scenario.goal])
         return bool(shapely.covers(self._area.polygon, straight)) and not shapely.intersects(self._fences, straight)
 
     def _end_by_stop(self, step: Step) -> Literal["stop", "timeout", "failure"] | None:

@@ -11,6 +11,8 @@ from cosim.place.street_map import Lane, StreetMap, Strip
 
 CAR_M = 2.0
 """Width of the widest vehicle."""
+_NEAR_M = 4.0
+"""Cars farther from a point do not matter to it."""
 _SLIVER_M = 0.5
 """Ground narrower than this is the rim of a corner, which a car brushes at most."""
 
@@ -23,15 +25,15 @@ def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.Li
 
 
 def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
-    """(N,) m: from (N, 2) points to the nearest middle line on which cars drive inside a junction; inf far from all."""
-    points = shapely.points(xy)
-    lines = paths_near(street_map, shapely.buffer(shapely.MultiPoint(points), 2.0 * CAR_M))
+    """(N,) m: from (N, 2) points to the nearest middle line on which cars drive inside a junction; inf beyond 4 m."""
+    points = np.asarray(shapely.points(xy), dtype=object)
+    lines = paths_near(street_map, shapely.buffer(shapely.MultiPoint(xy), _NEAR_M))
     far_m = np.full(len(xy), np.inf)
     if lines:
-        point, _ = (tree := shapely.STRtree(lines)).query(points, predicate="dwithin", distance=2.0 * CAR_M)
-        near = np.unique(point)
-        pairs, gap_m = tree.query_nearest(points[near], return_distance=True, all_matches=False)
-        far_m[near[pairs[0]]] = gap_m
+        near, gap_m = shapely.STRtree(lines).query_nearest(
+            points, max_distance=_NEAR_M, return_distance=True, all_matches=False
+        )
+        far_m[near[0]] = gap_m
     return far_m
 
 

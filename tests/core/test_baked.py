@@ -124,7 +124,7 @@ def test_a_full_disk_is_done_without_and_nothing_half_written_stays(room: Path, 
         "print([int(kept['n'].sum()) for kept in arrays])"
     )
     done = subprocess.run(
-        [sys.executable, "-c", code, str(room)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+        [sys.executable, "-B", "-c", code, str(room)], capture_output=True, text=True, timeout=PATIENCE_S, check=False
     )
     assert done.stdout == f"[{sum(range(200000))}, {sum(range(200000))}]\n", done.stderr
     assert done.stderr.startswith("note: ") and "not kept" in done.stderr and done.stderr.count("note: ") <= 2

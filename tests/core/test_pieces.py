@@ -119,7 +119,9 @@ def test_a_full_disk_leaves_no_half_a_piece(cache: Path) -> None:
         "resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096))\n"
         "print([int(Pieces('tiles', 'a').get(n, lambda: {'n': np.arange(200000)})['n'].sum()) for n in 'xy'])"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
+    done = subprocess.run(
+        [sys.executable, "-B", "-c", code], capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.stdout == f"[{sum(range(200000))}, {sum(range(200000))}]\n", done.stderr
     assert done.stderr.startswith("note: ") and done.stderr.count("note: ") <= 2
     assert [path.name for path in (cache / "tiles").rglob("*")] == ["a"]

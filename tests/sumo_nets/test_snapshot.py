@@ -109,7 +109,7 @@ def test_a_full_disk_leaves_no_half_snapshot(net: Path, tmp_path: Path) -> None:
     )
     kept = tmp_path / "full"
     done = subprocess.run(
-        [sys.executable, "-c", code, str(net)],
+        [sys.executable, "-B", "-c", code, str(net)],
         env=os.environ | {"COSIM_CACHE": str(kept)},
         capture_output=True,
         text=True,
