@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import math
-import stat
 import struct
 import zipfile
 import zlib
@@ -18,6 +17,8 @@ from typing import Any, BinaryIO, Final
 
 import numpy as np
 from numpy.typing import NDArray
+
+from cosim.core.whole_file import size_within
 
 MOST_NPZ_BYTES: Final = 2 << 30
 _MOST_ARRAYS: Final = 4096
@@ -38,11 +39,7 @@ def read_npz(
     Raises ValueError, which says what is wrong: no regular file, no .npz, cut off, damaged, objects in it, or more than
     `most_bytes`, packed or unpacked. OSError passes.
     """
-    about = path.stat()
-    if not stat.S_ISREG(about.st_mode):
-        raise ValueError("is no regular file")
-    if about.st_size > most_bytes:
-        raise ValueError(f"holds {about.st_size} bytes; at most {most_bytes} are read")
+    size_within(path, most_bytes)
     with path.open("rb") as file:
         return arrays_in(file, only, most_bytes)
 

@@ -14,10 +14,11 @@ import pandas as pd
 from cosim.core.errors import RunError, unwritable
 from cosim.core.npz import read_npz
 from cosim.core.telling import Tell
+from cosim.records.episode_files import RUN_AGAIN, TRAJECTORY, record_file, told_apart
 from cosim.records.record import Record
 from cosim.records.run_folder import RunFolder, read_records, read_spec, refuse_in_use
 from cosim.records.run_spec import RunSpec
-from cosim.records.whole_run import anew, check_records, read_record, record_file, told_apart
+from cosim.records.whole_run import check_records, read_record
 from cosim.spec.scenario import Scenario, read_suite
 
 
@@ -104,8 +105,8 @@ def _read(path: Path, first: _Part | None) -> _Part:
         file = record_file(path, name)
         if file.exists():
             records[name] = in_table[name] if name in in_table else _not_in_table(path, file, scenarios)
-            if records[name].ended is not None and not file.with_name("trajectory.npz").exists():
-                raise RunError(f"{file.with_name('trajectory.npz')}: not there: {anew(file)}")
+            if records[name].ended is not None and not file.with_name(TRAJECTORY).exists():
+                raise RunError(f"{file.with_name(TRAJECTORY)}: not there: {RUN_AGAIN}")
     return _Part(path, spec, records)
 
 
@@ -113,7 +114,7 @@ def _not_in_table(path: Path, file: Path, scenarios: Mapping[str, Scenario]) -> 
     """A record that was written a moment before its run was killed."""
     record = read_record(file)
     if record.scenario != file.parent.name:
-        raise RunError(f"{file} is of scenario '{record.scenario}': {anew(file)}")
+        raise RunError(f"{file} is of scenario '{record.scenario}': {RUN_AGAIN}")
     check_records(path, {record.scenario: record}, scenarios)
     return record
 
@@ -123,7 +124,7 @@ def _check_equal(name: str, one: _Part, other: _Part) -> None:
     mine, theirs = (msgspec.structs.replace(part.records[name], clock={}) for part in (other, one))
     apart = told_apart(mine, theirs)
     if not apart:
-        logs = [record_file(part.path, name).with_name("trajectory.npz") for part in (one, other)]
+        logs = [record_file(part.path, name).with_name(TRAJECTORY) for part in (one, other)]
         apart = "" if _same_arrays(*logs) else "trajectory.npz is another one"
     if apart:
         raise RunError(

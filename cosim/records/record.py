@@ -13,10 +13,10 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from cosim.core.errors import RunError
+from cosim.core.errors import RunError, SpecError
 from cosim.core.geometry import Floats
 from cosim.core.versions import versions
-from cosim.core.whole_file import write_whole
+from cosim.core.whole_file import read_within, write_whole
 from cosim.episode.camera_rules import nonstandard
 from cosim.episode.in_flight import InFlight
 from cosim.episode.log import Log
@@ -33,6 +33,7 @@ from cosim.spec.robot import robot_called
 from cosim.spec.scenario import Scenario, Split, content_hash
 
 _SCHEMA = 1
+_MOST_BYTES = 256 << 20
 METRIC_SCHEMA = 3
 """Raised whenever a definition of `cosim.judge.metrics` comes or changes; other schemas are not compared with it."""
 NO_RENDERER = "none"
@@ -148,16 +149,19 @@ class Record(msgspec.Struct, frozen=True, kw_only=True):
     def load(cls, path: Path) -> Record:
         """Read a record. Raises RunError naming the file and the field."""
         try:
-            return cls.decoded(path.read_bytes(), path)
+            data = read_within(path, _MOST_BYTES)
         except OSError as error:
+            raise RunError(f"{path}: not an episode record: {error.strerror}") from error
+        except ValueError as error:
             raise RunError(f"{path}: not an episode record: {error}") from error
+        return cls.decoded(data, path)
 
     @classmethod
     def decoded(cls, data: bytes, where: Path) -> Record:
         """The record in a file's bytes. where: what an error names. Raises RunError."""
         try:
             record = msgspec.json.decode(data, type=cls)
-        except msgspec.DecodeError as error:
+        except (msgspec.DecodeError, RecursionError, SpecError) as error:
             raise RunError(f"{where}: not an episode record: {error}") from error
         if record.schema != _SCHEMA:
             raise RunError(f"{where}: record schema {record.schema}; this version reads {_SCHEMA}")

@@ -30,21 +30,27 @@ from typing import Any, NamedTuple, Self
 import msgspec
 import pandas as pd
 
-from cosim.core.errors import MachineError, RunError, UsageError, listed, unknown, unwritable
-from cosim.core.whole_file import write_whole
+from cosim.core.errors import RunError, UsageError, listed, unknown, unwritable
+from cosim.core.whole_file import read_within, write_whole
+from cosim.records.database import (
+    DATABASE,
+    REMEDY,
+    check_database,
+    connected,
+    damaged,
+    is_damaged,
+    records_in,
+    trouble_with,
+)
+from cosim.records.episode_files import DEMONSTRATION, TRAJECTORY, damage_of_episode
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
-from cosim.records.run_spec import RunSpec
+from cosim.records.run_spec import RunSpec, decoded_spec
 from cosim.spec.scenario import Suite, write_suite
 
-DATABASE = "results.sqlite"
 _ATTEMPTS = "attempts.jsonl"
-DEMONSTRATION = "demonstration.npz"
-REMEDY = "give the command of the run again with --resume, which makes it anew from the records on disk"
+_MOST_BYTES = 256 << 20
 _KEPT = "finished episodes are kept; make room and go on with --resume"
-DAMAGE = {
-    sqlite3.SQLITE_ERROR, sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB, sqlite3.SQLITE_MISMATCH, sqlite3.SQLITE_SCHEMA,
-}  # fmt: skip
 UNFINISHED = {"episodes", "logs", "lock", "scenarios.json", "run.json.part"}
 """All that a run leaves that was killed before it began."""
 
@@ -81,6 +87,7 @@ class RunFolder:
     def resume(cls, path: Path, spec: RunSpec, whole: Suite | None = None) -> RunFolder:
         """The run folder at `path`, to be finished. Raises RunError, naming the difference, if it is of another run.
         whole: the suite that its scenarios are of."""
+        refuse_unbegun(path)
         found = read_spec(path)
         if found.policy == spec.policy and found.policy_source != spec.policy_source:
             raise RunError(
@@ -124,10 +131,10 @@ class RunFolder:
     def finished(self) -> set[str]:
         """Ids of the scenarios that have a row."""
         try:
-            with closing(_connect(self.path)) as database:
+            with closing(connected(self.path)) as database:
                 return {scenario for (scenario,) in database.execute("select scenario from episodes")}
         except sqlite3.Error as error:
-            raise _trouble(self.path, error) from error
+            raise trouble_with(self.path, error) from error
 
     def add(self, record: Record) -> None:
         """Append a finished episode. A second one of the same scenario is not taken."""
@@ -135,18 +142,26 @@ class RunFolder:
         text = msgspec.json.encode(record).decode()
         try:
             if self._adding is None:  # kept open: opening and closing takes longer than adding
-                self._adding = _connect(self.path)
+                self._adding = connected(self.path)
             with self._adding as database:
                 database.execute("insert or ignore into episodes values (?, ?, ?)", (record.scenario, row, text))
         except sqlite3.Error as error:
-            raise _trouble(self.path, error) from error
+            raise trouble_with(self.path, error) from error
+
+    def _remove(self, scenarios: Sequence[str]) -> None:
+        """Remove the rows of episodes that are to be run again."""
+        try:
+            with closing(connected(self.path)) as database, database:
+                database.executemany("delete from episodes where scenario = ?", [(name,) for name in scenarios])
+        except sqlite3.Error as error:
+            raise trouble_with(self.path, error) from error
 
     def keep(self, record: Record, log: bytes = b"", demonstration: bytes = b"") -> None:
         """Write what came out of an episode, the record last, and add its row. log: the bytes of its `Log`."""
         target = self.episode_folder(record.scenario)
         try:
             target.mkdir(parents=True, exist_ok=True)
-            for name, data in (("trajectory.npz", log), (DEMONSTRATION, demonstration)):
+            for name, data in ((TRAJECTORY, log), (DEMONSTRATION, demonstration)):
                 if data:
                     write_whole(target / name, data)
             record.save(target / "record.json")
@@ -185,28 +200,18 @@ class RunFolder:
         except OSError as error:
             raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
 
-    def _adopt(self, scenario_id: str) -> bool:
-        """Take in the record of a scenario that has no row; False when there is none, or a damaged one."""
-        path = self.episode_folder(scenario_id) / "record.json"
-        if not path.exists():
-            return False
-        try:
-            record = Record.load(path)
-        except RunError as error:
-            self.notes.append(f"{error}. This episode is run again.")
-            return False
-        if record.scenario != scenario_id:
-            self.notes.append(f"{path} is of scenario '{record.scenario}'. This episode is run again.")
-            return False
-        self.add(record)
-        return True
+    def _is_whole(self, scenario_id: str, row: Record | None = None) -> bool:
+        """Whether what an episode has left can be kept; what is damaged is noted."""
+        if damage := damage_of_episode(self.path, scenario_id, row):
+            self.notes.append(f"{damage}. This episode is run again.")
+        return not damage
 
     def forget(self, scenario_id: str) -> None:
         """Remove what an earlier attempt at a scenario has left."""
         folder = self.episode_folder(scenario_id)
         shutil.rmtree(folder / "frames", ignore_errors=True)
         try:
-            for name in ("record.json", "trajectory.npz", DEMONSTRATION):
+            for name in ("record.json", TRAJECTORY, DEMONSTRATION):
                 (folder / name).unlink(missing_ok=True)
                 (folder / f"{name}.part").unlink(missing_ok=True)
         except OSError as error:
@@ -236,42 +241,55 @@ class RunFolder:
             raise unwritable(self.path, error) from error
 
     def _open_database(self) -> None:
-        """Make sure of a sound database with a row for every record on disk; a damaged one is made anew from these."""
+        """Make sure of a sound database with a row for each episode that is whole on disk, and for no other."""
         database, mended = self.path / DATABASE, ""
         try:
-            _check(self.path)
+            check_database(self.path)
         except (sqlite3.Error, msgspec.DecodeError) as error:
-            if isinstance(error, sqlite3.Error) and not _is_damage(error):
-                raise _trouble(self.path, error) from error
+            if isinstance(error, sqlite3.Error) and not is_damaged(error):
+                raise trouble_with(self.path, error) from error
             mended = str(error)
             for end in ("-wal", "-shm"):
                 database.with_name(DATABASE + end).unlink(missing_ok=True)
             database.replace(database.with_name(DATABASE + ".damaged"))
-            _check(self.path)
+            check_database(self.path)
+        rows = [] if self._suite is not None else read_records(self.path)
+        if gone := [row.scenario for row in rows if not self._is_whole(row.scenario, row)]:
+            self._remove(gone)
         on_disk = {p.parent.name: p.stat().st_mtime_ns for p in self.path.glob("episodes/*/record.json")}
-        missing = sorted(set(self.spec.scenarios) & on_disk.keys() - self.finished(), key=on_disk.__getitem__)
-        taken = sum([self._adopt(scenario_id) for scenario_id in missing])
+        lacking = set(self.spec.scenarios) & on_disk.keys() - self.finished() - {*gone}
+        whole = [name for name in sorted(lacking, key=on_disk.__getitem__) if self._is_whole(name)]
+        for name in whole:
+            self.add(Record.load(self.episode_folder(name) / "record.json"))
         if mended:
-            self.notes.append(
-                f"{database} was damaged ({mended}): made anew from {taken} records on disk, kept as {DATABASE}.damaged"
-            )
+            made = f"made anew from {len(whole)} records on disk, kept as {DATABASE}.damaged"
+            self.notes.append(f"{database} was damaged ({mended}): {made}")
 
 
 def read_spec(path: Path) -> RunSpec:
     """What the run in a folder is. Raises UsageError, with the runs in it and beside it, when it holds none."""
     try:
-        return msgspec.json.decode((path / "run.json").read_bytes(), type=RunSpec)
+        return decoded_spec(read_within(path / "run.json", _MOST_BYTES), path / "run.json")
     except FileNotFoundError:
         near = [str(run.parent) for run in (*path.glob("*/run.json"), *path.parent.glob("*/run.json"))]
         if path.is_dir():
+            refuse_unbegun(path)
             there = f"Runs in it and beside it: {listed(str(path), near)}"
             raise UsageError(f"{path} is no run folder: it holds no run.json. {there}") from None
         raise unknown("run", str(path), near) from None
     except NotADirectoryError:
         raise UsageError(f"{path} is no run folder: a file is there, and a run is a folder with run.json") from None
-    except (OSError, msgspec.DecodeError) as error:
-        why = error.strerror if isinstance(error, OSError) else error
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", error)
         raise RunError(f"{path / 'run.json'}: cannot be read: {why}: name another run, or run it again") from error
+
+
+def refuse_unbegun(path: Path) -> None:
+    """Raises UsageError where a run is to be resumed that was stopped before its folder was written, or never given."""
+    if not path.exists() or (path.is_dir() and {entry.name for entry in path.iterdir()} <= UNFINISHED):
+        raise UsageError(
+            f"{path}: no run has begun there, so that nothing is kept: give the command of the run without --resume"
+        )
 
 
 def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
@@ -287,11 +305,11 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
             where = Path(stack.enter_context(TemporaryDirectory())) if untouched else path
             for file in path.glob(f"{DATABASE}*") if untouched else ():
                 shutil.copyfile(file, where / file.name)
-            return _records(stack.enter_context(closing(_connect(where))))
+            return records_in(stack.enter_context(closing(connected(where))))
     except msgspec.DecodeError as error:
-        raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
+        raise damaged(path, error) from error
     except sqlite3.Error as error:
-        raise _trouble(path, error) from error
+        raise trouble_with(path, error) from error
     except OSError as error:
         raise RunError(f"{path / DATABASE}: cannot be read: {error.strerror or error}") from error
 
@@ -299,13 +317,13 @@ def read_records(path: Path, *, untouched: bool = False) -> list[Record]:
 def read_rows(path: Path) -> dict[str, dict[str, Any]]:
     """The row of each scenario as `results.sqlite` has it. Raises RunError."""
     try:
-        with closing(_connect(path)) as database:
+        with closing(connected(path)) as database:
             rows = database.execute("select scenario, row from episodes").fetchall()
         return {scenario: json.loads(row) for scenario, row in rows}
     except json.JSONDecodeError as error:
-        raise RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}") from error
+        raise damaged(path, error) from error
     except sqlite3.Error as error:
-        raise _trouble(path, error) from error
+        raise trouble_with(path, error) from error
 
 
 def refuse_in_use(path: Path) -> None:
@@ -356,42 +374,3 @@ def _in_use(path: Path, lock: int) -> RunError:
         f"{path} is in use by process {holder}: another cosim run is writing to it. "
         "Wait for it to end, or choose another --out."
     )
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    database = sqlite3.connect(path / DATABASE, timeout=30.0)
-    try:
-        database.execute("pragma journal_mode = wal")
-        database.execute("pragma synchronous = full")
-    except sqlite3.Error:
-        database.close()
-        raise
-    return database
-
-
-def _check(path: Path) -> None:
-    """Read all of the database, made where there is none. Raises sqlite3.Error or DecodeError if it is damaged."""
-    with closing(_connect(path)) as database, database:
-        database.execute("create table if not exists episodes (scenario text primary key, row text, record text)")
-        faults = [fault for (fault,) in database.execute("pragma quick_check")]
-        if faults != ["ok"]:
-            raise sqlite3.DatabaseError(faults[0])
-        _records(database)
-
-
-def _records(database: sqlite3.Connection) -> list[Record]:
-    rows: Sequence[tuple[str]] = database.execute("select record from episodes order by rowid").fetchall()
-    return [msgspec.json.decode(text, type=Record) for (text,) in rows]
-
-
-def _is_damage(error: sqlite3.Error) -> bool:
-    """Whether it is the file that is wrong, not the disk or who holds it."""
-    code = getattr(error, "sqlite_errorcode", sqlite3.SQLITE_CORRUPT)
-    return code & 0xFF in DAMAGE or code == sqlite3.SQLITE_IOERR_SHORT_READ
-
-
-def _trouble(path: Path, error: sqlite3.Error) -> RunError | MachineError:
-    """What is said of an error of the database."""
-    if _is_damage(error):
-        return RunError(f"{path / DATABASE} is damaged ({error}): {REMEDY}")
-    return MachineError(f"{path / DATABASE}: {error}. Finished episodes are safe: make room and add --resume.")

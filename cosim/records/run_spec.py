@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from pathlib import Path
 from typing import NamedTuple, TypeVar
 
 import msgspec
 
-from cosim.core.errors import UsageError
+from cosim.core.errors import RunError, UsageError
 from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.odometry import OdometryKind
@@ -17,6 +18,8 @@ from cosim.spec.scenario import Suite
 from cosim.spec.selection import selection_in_words
 
 _T = TypeVar("_T")
+SCHEMA = 1
+"""Raised whenever run.json changes its meaning; other schemas are refused."""
 SAME = (
     "suite", "robots", "suite_version", "suite_hash", "policy", "policy_version", "policy_source", "policy_runs",
     "scenarios", "versions", "renderer", "counterfactual", "waypoints", "seed",
@@ -69,6 +72,12 @@ class Apart(NamedTuple):
     hint: str
 
 
+class _Schema(msgspec.Struct):
+    """The part of a run.json that says how the rest is to be read."""
+
+    schema: int = 1
+
+
 class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     """What a run is. Two runs with the same RunSpec have the same results. renderer: what draws the pictures.
     counterfactual: whether each episode is compared with its street without the robot. policy_source: hash of the file
@@ -102,7 +111,7 @@ class RunSpec(msgspec.Struct, frozen=True, kw_only=True):
     shared_renderer: bool = False
     metric_schema: int = 0
     shard: Shard | None = None
-    schema: int = 1
+    schema: int = SCHEMA
 
     def apart(self, other: RunSpec, but: str = "", whole: Suite | None = None) -> Apart | None:
         """The first field in which another run is not the same; None where it is. but: a field that may differ. whole:
@@ -133,6 +142,20 @@ def _counted(ids: Sequence[str], others: Sequence[str]) -> str:
     """How many scenarios, and one of them that is not among the others."""
     more = next((f", with {name}" for name in ids if name not in others), "")
     return f"{len(ids)}{more}"
+
+
+def decoded_spec(data: bytes, where: Path) -> RunSpec:
+    """What the bytes of a run.json say. where: what an error names. Raises RunError for another schema, ValueError for
+    bytes that are no run.json."""
+    try:
+        if (schema := msgspec.json.decode(data, type=_Schema).schema) != SCHEMA:
+            raise RunError(
+                f"{where}: run schema {schema}, and this version reads {SCHEMA}: use the version of cosim that made "
+                "the run, which is in its `versions`"
+            )
+        return msgspec.json.decode(data, type=RunSpec)
+    except RecursionError as error:
+        raise ValueError("brackets within brackets within brackets") from error
 
 
 def _brief(value: object) -> str:

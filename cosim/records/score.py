@@ -21,10 +21,12 @@ from cosim.episode.log import Log
 from cosim.judge.event_monitor import why_invalid
 from cosim.judge.evidence import contradictions
 from cosim.judge.metrics import COUNTERFACTUAL, METRICS, EpisodeFacts, every_metric
+from cosim.records.database import DATABASE
+from cosim.records.episode_files import RUN_AGAIN, TRAJECTORY, record_file
 from cosim.records.record import Record
 from cosim.records.results import table_of, table_row
-from cosim.records.run_folder import DATABASE, read_rows
-from cosim.records.whole_run import WholeRun, anew, read_whole_run, record_file
+from cosim.records.run_folder import read_rows
+from cosim.records.whole_run import WholeRun, read_whole_run
 from cosim.spec.scenario import Scenario
 
 _TABLE = "results.csv"
@@ -95,11 +97,11 @@ def _scored(run: WholeRun, scenario: Scenario, record: Record) -> tuple[Record, 
 
 
 def _trajectory(path: Path, scenario_id: str) -> Log:
-    file = record_file(path, scenario_id).with_name("trajectory.npz")
+    file = record_file(path, scenario_id).with_name(TRAJECTORY)
     try:
         return Log.load(file)
     except RunError as error:
-        raise RunError(f"{error}: {anew(file)}") from error
+        raise RunError(f"{error}: {RUN_AGAIN}") from error
 
 
 def _rows_that_differ(path: Path, computed: list[Record]) -> Iterator[Difference]:

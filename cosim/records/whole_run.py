@@ -6,13 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
-
 from cosim.core.errors import RunError
+from cosim.records.database import DATABASE
+from cosim.records.episode_files import RUN_AGAIN, record_file, told_apart
 from cosim.records.record import METRIC_SCHEMA, Record
-from cosim.records.run_folder import DATABASE, read_records, read_spec, refuse_in_use
+from cosim.records.run_folder import read_records, read_spec, refuse_in_use
 from cosim.records.run_spec import RunSpec
-from cosim.spec.ranges import shown
 from cosim.spec.scenario import Scenario, content_hash, read_suite
 
 _UNTOLD = "an earlier version, which did not tell its metric schema"
@@ -62,22 +61,9 @@ def check_record_file(path: Path, record: Record) -> None:
     file = record_file(path, record.scenario)
     if not file.exists():
         if record.ended is not None:
-            raise RunError(f"{file}: not there: {anew(file)}")
+            raise RunError(f"{file}: not there: {RUN_AGAIN}")
     elif apart := told_apart(read_record(file), record):
-        raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {anew(file)}")
-
-
-def record_file(path: Path, scenario_id: str) -> Path:
-    """Where the record of an episode is."""
-    return path / "episodes" / scenario_id / "record.json"
-
-
-def anew(file: Path) -> str:
-    """What mends an episode whose file is damaged or missing."""
-    return (
-        f"remove {file.parent} and {file.parents[2] / DATABASE}, and give the command of the run again with --resume, "
-        "which runs this episode anew and keeps the others"
-    )
+        raise RunError(f"{file}: not what {DATABASE} has of this episode: {apart}: {RUN_AGAIN}")
 
 
 def read_record(file: Path) -> Record:
@@ -85,20 +71,7 @@ def read_record(file: Path) -> Record:
     try:
         return Record.load(file)
     except RunError as error:
-        raise RunError(f"{error}: {anew(file)}") from error
-
-
-def told_apart(mine: Record, theirs: Record) -> str:
-    """Where two records of an episode are first apart, in words; "" where they are not."""
-    told, other = (msgspec.to_builtins(record) for record in (mine, theirs))
-    for field, value in told.items():
-        if isinstance(value, dict):
-            for name in dict.fromkeys([*value, *other[field]]):
-                if value.get(name) != other[field].get(name):
-                    return f"{field}.{name} is {value.get(name)}, there {other[field].get(name)}"
-        elif value != other[field]:
-            return f"{field} is {shown(value)}, there {shown(other[field])}"
-    return ""
+        raise RunError(f"{error}: {RUN_AGAIN}") from error
 
 
 def _check_schema(path: Path, record: Record) -> None:

@@ -27,8 +27,9 @@ from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
 from cosim.episode.driver import Driver
 from cosim.policies.own_module import importable
+from cosim.records.episode_files import DEMONSTRATION
 from cosim.records.record import Record
-from cosim.records.run_folder import DEMONSTRATION, RunFolder
+from cosim.records.run_folder import RunFolder
 from cosim.spec.collecting import Collecting
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, read_suite

@@ -22,7 +22,7 @@ from cosim.episode.given import with_goal
 from cosim.episode.ports import Policy
 from cosim.policies.own_module import importable
 from cosim.records.record import METRIC_SCHEMA, NO_RENDERER
-from cosim.records.run_folder import RunFolder, read_spec
+from cosim.records.run_folder import RunFolder, read_spec, refuse_unbegun
 from cosim.records.run_spec import RunSpec, Shard
 from cosim.spec.options import EpisodeOptions
 from cosim.spec.policy_host import PolicyHost
@@ -296,4 +296,7 @@ def seed_of_run(asked: int | None, resumed: Path | None) -> int:
     """The seed that was asked for; else that of the run that is resumed; else one that is drawn anew."""
     if asked is not None:
         return asked
-    return drawn_seed() if resumed is None else read_spec(resumed).seed
+    if resumed is None:
+        return drawn_seed()
+    refuse_unbegun(resumed)
+    return read_spec(resumed).seed

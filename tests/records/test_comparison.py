@@ -295,7 +295,7 @@ def other_suite(run: Path, name: str, **fields: object) -> None:
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "truncated record": (
         lambda run: truncate(run / "episodes/s-001/record.json"),
-        "{run}/episodes/s-001/record.json: not an episode record: Input data was truncated: remove",
+        "{run}/episodes/s-001/record.json: not an episode record: Input data was truncated: give the command",
     ),
     "another schema": (
         lambda run: rewrite_record(run, metric_schema=2),

@@ -24,6 +24,7 @@ from cosim.records.run_folder import RunFolder, read_records, read_spec
 from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
+from tests.records.driven_runs import driven
 
 
 def scenario(name: str) -> Scenario:
@@ -49,6 +50,18 @@ def record(name: str, *, success: float = 1.0, status: str = "done", wall_s: flo
         ended="goal" if status == "done" else None, ticks=3, state_hash="abc", measures=measures,
         clock={"wall_s": wall_s},
     )  # type: ignore[arg-type]  # fmt: skip
+
+
+LOG = driven(SUITE.scenarios[0], [1.0] * 3).encoded()
+"""Of three ticks, as `record` has."""
+
+
+def on_disk(folder: RunFolder, kept: Record, under: str = "") -> None:
+    """Write the files of an episode, and no row. under: in the folder of another one."""
+    place = folder.episode_folder(under or kept.scenario)
+    place.mkdir(parents=True, exist_ok=True)
+    (place / "trajectory.npz").write_bytes(LOG)
+    kept.save(place / "record.json")
 
 
 def test_the_table_does_not_depend_on_the_order_in_which_episodes_end(tmp_path: Path) -> None:
@@ -214,7 +227,7 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
     """Whatever happened to results.sqlite: showing it says the remedy, and resuming finds every record on disk."""
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         for i in (2, 0):
-            folder.keep(record(f"s-{i}"))
+            folder.keep(record(f"s-{i}"), LOG)
             os.utime(folder.episode_folder(f"s-{i}") / "record.json", (0, 10 - i))
     DAMAGES[name](tmp_path / "run/results.sqlite")
     with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"):
@@ -235,7 +248,7 @@ def test_a_database_without_its_log_is_made_whole(tmp_path: Path) -> None:
             "import os, sys; from pathlib import Path; sys.path.insert(0, sys.argv[2]);"
             "from test_run_folder import *; held = RunFolder.create(Path(sys.argv[1]), SPEC, SUITE).__enter__();"
             "keep = sqlite3.connect(held.path / 'results.sqlite'); keep.execute('select * from episodes').fetchall();"
-            "held.keep(record('s-1')); os.kill(os.getpid(), 9)"
+            "held.keep(record('s-1'), LOG); os.kill(os.getpid(), 9)"
         )
         killed = subprocess.run([sys.executable, "-c", code, str(path), str(Path(__file__).parent)], check=False)
         assert killed.returncode == -9 and (path / "results.sqlite-wal").stat().st_size > 0
@@ -250,11 +263,11 @@ def test_a_database_that_goes_during_a_run_is_told_with_the_remedy(tmp_path: Pat
     with RunFolder.create(tmp_path / "run", SPEC, SUITE) as folder:
         (tmp_path / "run/results.sqlite").write_bytes(b"no database" * 1000)
         with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.keep(record("s-0"))
+            folder.keep(record("s-0"), LOG)
         for path in (tmp_path / "run").glob("results.sqlite*"):
             path.unlink()
         with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume"):
-            folder.keep(record("s-0"))
+            folder.keep(record("s-0"), LOG)
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished() == {"s-0"}
 
@@ -275,8 +288,8 @@ def test_a_damaged_record_is_run_again(tmp_path: Path) -> None:
         for i in range(3):
             folder.episode_folder(f"s-{i}").mkdir()
         (folder.episode_folder("s-0") / "record.json").write_text("{")
-        record("s-2").save(folder.episode_folder("s-1") / "record.json")
-        record("s-2").save(folder.episode_folder("s-2") / "record.json")
+        on_disk(folder, record("s-2"), "s-1")
+        on_disk(folder, record("s-2"))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished() == {"s-2"}
         assert len(again.notes) == 2 and all(note.endswith("This episode is run again.") for note in again.notes)
@@ -295,17 +308,15 @@ def test_nothing_of_an_earlier_attempt_stays_beside_a_crash(tmp_path: Path) -> N
 
 
 def test_an_episode_whose_row_was_lost_to_a_kill_is_taken_in(tmp_path: Path) -> None:
-    """A record on disk without a row counts as finished when the run is resumed; one with a row stays as it was."""
+    """A record on disk without a row counts as finished when the run is resumed; one that is not its row's does not."""
     folder = RunFolder.create(tmp_path / "run", SPEC, SUITE)
     with folder:
         folder.add(record("s-0", success=1.0))
         for name in ("s-0", "s-1"):
-            folder.episode_folder(name).mkdir(parents=True)
-            record(name, success=0.0).save(folder.episode_folder(name) / "record.json")
+            on_disk(folder, record(name, success=0.0))
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
-        assert again.finished() == {"s-0", "s-1"}
-    values = {r.scenario: r.measures["success"] for r in read_records(tmp_path / "run")}
-    assert values == {"s-0": 1.0, "s-1": 0.0}
+        assert again.finished() == {"s-1"} and "not what results.sqlite has of this episode" in again.notes[0]
+    assert {r.scenario: r.measures["success"] for r in read_records(tmp_path / "run")} == {"s-1": 0.0}
 
 
 def test_a_crashed_episode_counts_as_a_failure(tmp_path: Path) -> None:

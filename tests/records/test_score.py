@@ -205,24 +205,27 @@ def test_an_edited_suite_is_refused(tmp_path: Path, cosim: Cosim) -> None:
 
 
 @pytest.mark.parametrize("name", ["record.json", "trajectory.npz"])
-@pytest.mark.parametrize("damage", ["truncated", "gone"])
-def test_a_damaged_episode_is_refused_and_can_be_mended(tmp_path: Path, cosim: Cosim, name: str, damage: str) -> None:
-    """File and remedy are named; done as told, the run takes up again with this episode alone to be run."""
-    run = run_of(tmp_path / "run", ["goal", HIT, "goal"])
+@pytest.mark.parametrize("damage", ["truncated", "a bit", "gone"])
+def test_a_damaged_episode_is_refused_and_run_again(tmp_path: Path, cosim: Cosim, name: str, damage: str) -> None:
+    """File and remedy are named; `--resume` names it, too, and has this episode alone to be run."""
+    run = run_of(tmp_path / "run", ["goal", HIT, "goal", "crashed"])
     file = run / "episodes/s-001" / name
+    data = file.read_bytes()
     if damage == "truncated":
-        file.write_bytes(file.read_bytes()[:200])
+        file.write_bytes(data[:200])
+    elif damage == "a bit":
+        at = data.index(b'"ticks": ') + 9 if name == "record.json" else 200
+        file.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
     else:
         file.unlink()
     told = refusal(cosim, run)
-    database = run / "results.sqlite"
-    assert f"error: {file}: not " in told and f"remove {file.parent} and {database}, and give the command" in told
-    for one in file.parent.iterdir():
-        one.unlink()
-    file.parent.rmdir()
-    database.unlink()
+    assert f"error: {file}: not " in told and "give the command of the run again with --resume, which" in told
     with RunFolder.resume(run, read_spec(run)) as folder:
-        assert folder.finished() == {"s-000", "s-002"}
+        assert folder.finished() == {"s-000", "s-002", "s-003"}
+        (note,) = folder.notes
+        assert note.startswith(f"{file}: ") and note.endswith(". This episode is run again.")
+    with RunFolder.resume(run, read_spec(run)) as again:
+        assert again.finished() == {"s-000", "s-002", "s-003"}
 
 
 def test_what_is_no_run_is_told_with_a_remedy(tmp_path: Path, cosim: Cosim) -> None:
@@ -242,7 +245,10 @@ def test_a_record_that_is_not_what_the_database_has_is_refused(tmp_path: Path, c
     told = refusal(cosim, run)
     shown = cosim("show", str(run))
     assert shown.returncode == 2 and not shown.stdout and shown.stderr.splitlines()[-1] == told.splitlines()[-1]
-    assert f"{file}: not what results.sqlite has of this episode: measures.success is 0.5, there 1.0: remove" in told
+    assert (
+        f"{file}: not what results.sqlite has of this episode: measures.success is 0.5, there 1.0: give the comm"
+        in told
+    )
 
 
 def test_another_metric_schema_is_refused(tmp_path: Path, cosim: Cosim) -> None:

@@ -14,7 +14,7 @@ import typer
 from cosim.cli.options.endpoint import DEFAULT, Insecure, Tls, connecting, listening, warned
 from cosim.cli.options.panels import MANY
 from cosim.cli.options.taking import taking
-from cosim.cli.runs.run import carry_out
+from cosim.cli.runs.run import carry_out, told_if_not_begun
 from cosim.cli.terminal.consoles import err
 from cosim.cli.terminal.logs import LogJson, LogLevel, logged
 from cosim.core.errors import INTERRUPTED, UsageError
@@ -71,7 +71,8 @@ def coordinator_command(
             _say(f"Workers find it by: cosim worker --connect {listen.replace('0.0.0.0', 'THIS-MACHINE')}")
             yield partial(workers_of_run, session, resumed=bool(asked["resume"]))
 
-    carry_out(**asked, tls=files, insecure=insecure and bool(at), carrier=carrier())
+    with told_if_not_begun(asked["folder"]):
+        carry_out(**asked, tls=files, insecure=insecure and bool(at), carrier=carrier())
 
 
 @coordinator_app.command(

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shlex
 import sys
-from collections.abc import Sequence
-from contextlib import AbstractContextManager, ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from datetime import datetime
 from functools import partial
 from pathlib import Path
@@ -324,4 +324,19 @@ def run_command(
         check_on_ray(on, {f"--{name.replace('_', '-')}": asked[name] for name in of_here})
         say = partial(err.print, soft_wrap=True, highlight=False, markup=False)
         asked["carrier"] = by_ray(on, jobs, asked["policy"], say)
-    carry_out(jobs=1 if on else jobs or 1, **asked)
+    with told_if_not_begun(asked["folder"]):
+        carry_out(jobs=1 if on else jobs or 1, **asked)
+
+
+@contextmanager
+def told_if_not_begun(folder: Path | None) -> Iterator[None]:
+    """Where Ctrl-C ends a run before its folder was written, print that there is nothing to resume."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        if folder is not None and not (folder / "run.json").exists():
+            words = (
+                f"Stopped before the run began: {folder} holds nothing. Give the same command again, without --resume."
+            )
+            err.print(words, soft_wrap=True, highlight=False, markup=False)
+        raise

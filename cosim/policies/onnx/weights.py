@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
-import stat
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -13,6 +13,7 @@ from typing import Final
 from platformdirs import user_data_path
 
 from cosim.core.errors import UsageError
+from cosim.core.whole_file import read_within, size_within
 from cosim.policies.onnx.graph_file import external_files, weights_not_finite
 from cosim.policies.onnx.manifest import BundleManifest, FileFacts, file_facts, refusal_of_name
 
@@ -115,29 +116,23 @@ def _inside(path: Path, folder: Path) -> Path:
 
 def read_file(path: Path, most_bytes: int = _MOST_GRAPH_BYTES) -> bytes:
     """All of a file, by default of a graph. Raises UsageError for what is no regular file, and for more bytes."""
-    _size(path, most_bytes)
-    try:
-        return path.read_bytes()
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
+    with _read_in_words(path):
+        return read_within(path, most_bytes)
 
 
-def _size(path: Path, most_bytes: int) -> int:
-    """How many bytes a file holds. Raises UsageError for what is no regular file, and for more than are read."""
+@contextmanager
+def _read_in_words(path: Path) -> Iterator[None]:
     try:
-        about = path.stat()
+        yield
     except OSError as error:
         raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
-    if not stat.S_ISREG(about.st_mode):
-        raise UsageError(f"{path}: is no regular file")
-    if about.st_size > most_bytes:
-        raise UsageError(f"{path}: holds {about.st_size} bytes; at most {most_bytes} are read")
-    return about.st_size
+    except ValueError as error:
+        raise UsageError(f"{path}: {error}") from error
 
 
 def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> None:
     """Take a file into a digest, piece by piece. Raises UsageError for one that is another than its manifest says."""
-    size, said = _size(path, _MOST_BYTES), manifest.files.get(path.name)
+    said = manifest.files.get(path.name)
     told: dict[str, int | str] = {} if said is None else {"bytes": said.bytes, **said.hashes}
 
     def check(what: str, found: int | str) -> None:
@@ -147,17 +142,16 @@ def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.b
                 f"{told[what]} there, {found} found"
             )
 
-    check("bytes", size)
-    digest.update(f"{name}\0{size}\0".encode())
     blake2b, sha256 = hashlib.blake2b(digest_size=32), hashlib.sha256()
-    try:
+    with _read_in_words(path):
+        size = size_within(path, _MOST_BYTES)
+        check("bytes", size)
+        digest.update(f"{name}\0{size}\0".encode())
         with path.open("rb") as file:
             while piece := file.read(_PIECE_BYTES):
                 digest.update(piece)
                 if told:
                     blake2b.update(piece)
                     sha256.update(piece)
-    except OSError as error:
-        raise UsageError(f"{path}: cannot be read: {error.strerror}") from error
     check("blake2b", blake2b.hexdigest())
     check("sha256", sha256.hexdigest())

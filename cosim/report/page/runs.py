@@ -15,10 +15,11 @@ from cosim.core.errors import RunError, UsageError
 from cosim.core.npz import read_npz
 from cosim.core.telling import Tell, untold
 from cosim.episode.log import Log
+from cosim.records.episode_files import RUN_AGAIN, TRAJECTORY, record_file
 from cosim.records.record import Record
 from cosim.records.results import table_of
 from cosim.records.run_spec import RunSpec
-from cosim.records.whole_run import WholeRun, anew, read_whole_run, record_file
+from cosim.records.whole_run import WholeRun, read_whole_run
 from cosim.spec.scenario import CityMap, Light, Scenario
 
 PaperTable = Literal["unit", "reactive", "long"]
@@ -74,26 +75,26 @@ class ReportedRun:
     def log(self, scenario: str) -> Log | None:
         """The trajectory of an episode; None where the folder has none. Raises RunError for a damaged one."""
         file = record_file(self.path, scenario)
-        path = file.with_name("trajectory.npz")
+        path = file.with_name(TRAJECTORY)
         if not path.exists():
             return None
         try:
             return Log.load(path)
         except RunError as error:
-            raise RunError(f"{error}: {anew(file)}") from error
+            raise RunError(f"{error}: {RUN_AGAIN}") from error
 
     def tracks(self) -> Iterator[tuple[Record, Mapping[str, Any]]]:
         """_COLUMNS of the log of each episode that counts and has a trajectory; an invalid one does not count. Raises
         RunError for a damaged one."""
         for record in self.records:
             file = record_file(self.path, record.scenario)
-            path = file.with_name("trajectory.npz")
+            path = file.with_name(TRAJECTORY)
             if record.status != "done" or not path.exists():
                 continue
             try:
                 read = read_npz(path, _COLUMNS)
             except (OSError, ValueError) as error:
-                raise RunError(f"{path}: not a trajectory: {error}: {anew(file)}") from error
+                raise RunError(f"{path}: not a trajectory: {error}: {RUN_AGAIN}") from error
             yield record, read
 
 
