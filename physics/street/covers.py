@@ -9,8 +9,11 @@ from typing import Final
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
 from cosim.core.geometry import Floats
+from cosim.place import overlay
 from cosim.place.open_ground import open_ground
 from cosim.place.street_map import LandKind, StreetMap
 from physics.world.mesh import Mesh, join, plan_triangles, quads
@@ -19,17 +22,24 @@ from physics.world.tiles import Tile, square
 _LIFT_M: Final = 0.003
 _GRID_M: Final = 1e-4
 """Ends of edges nearer to one another than about this are the same."""
+_AT_END_M: Final = 0.005
+_LEVEL_M: Final = 1e-6
 
 
-def covers_in(street_map: StreetMap, tile: Tile) -> list[tuple[LandKind, Mesh]]:
-    """What lies on the open ground of a tile, by its look; where nothing lies the ground shows its own."""
+def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, Mesh]:
+    """What lies on the open ground of a tile, by its look; where nothing lies the ground shows its own. rims: upright
+    ones around each cover, so that a low eye does not look under it; they take two thirds of all triangles."""
     if "ground" not in tile.parts:
-        return []
-    laid = [
-        (kind, laid_over(tile.parts["ground"], area))
-        for kind, area in open_ground(street_map, shapely.box(*square(tile.key)))
-    ]
-    return [(kind, mesh) for kind, mesh in laid if len(mesh)]
+        return {}
+    ground, found = tile.parts["ground"], {}
+    outline = overlay.union_all(_outlines(ground))
+    for kind, area in open_ground(street_map, shapely.box(*square(tile.key))):
+        mesh = _spread(ground, area)
+        if rims:
+            mesh = _edged(mesh, shapely.boundary(overlay.intersection(area, outline)))
+        if len(mesh):
+            found[kind] = mesh
+    return found
 
 
 def laid_over(mesh: Mesh, area: shapely.Geometry) -> Mesh:
@@ -37,11 +47,23 @@ def laid_over(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     return _edged(_clipped(mesh, area))
 
 
+def _spread(mesh: Mesh, area: shapely.Geometry) -> Mesh:
+    """As `_clipped`, but where the mesh is level in as few triangles as the area needs."""
+    height = mesh.vertices[mesh.triangles][:, :, 2]
+    level = (height > height.max() - _LEVEL_M).all(axis=1)
+    sheet = overlay.intersection(overlay.union_all(_outlines(mesh)[level]), area)
+    parts = [part for part in shapely.get_parts(shapely.simplify(sheet, 1e-3)) if isinstance(part, Polygon)]
+    xy = plan_triangles(parts)[0].reshape(-1, 2) if parts else np.zeros((0, 2))
+    corners = np.column_stack([xy, np.full(len(xy), height.max() + _LIFT_M)])
+    up = np.tile([0.0, 0.0, 1.0], (len(xy), 1))
+    flat = Mesh(corners, up, np.arange(len(xy), dtype=np.int32).reshape(-1, 3))
+    return join([flat, _clipped(Mesh(mesh.vertices, mesh.normals, mesh.triangles[~level]), area)])
+
+
 def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     """The parts of a mesh's triangles that lie in an area, lifted a little."""
     shapely.prepare(area)
-    corners = mesh.vertices[mesh.triangles]
-    outlines = np.asarray(shapely.polygons(corners[:, :, :2]), dtype=object)
+    corners, outlines = mesh.vertices[mesh.triangles], _outlines(mesh)
     met = np.flatnonzero(shapely.intersects(area, outlines))
     whole = shapely.contains_properly(area, outlines[met])
     kept = met[whole]
@@ -55,16 +77,26 @@ def _clipped(mesh: Mesh, area: shapely.Geometry) -> Mesh:
     return join(found)
 
 
-def _edged(mesh: Mesh) -> Mesh:
-    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look under it."""
+def _outlines(mesh: Mesh) -> NDArray[np.object_]:
+    """The triangles of a mesh from above."""
+    return np.asarray(shapely.polygons(mesh.vertices[mesh.triangles][:, :, :2]), dtype=object)
+
+
+def _edged(mesh: Mesh, ends: shapely.Geometry | None = None) -> Mesh:
+    """A mesh with an upright rim under every edge at which it ends, so that a low eye does not look under it.
+
+    ends: where it does; None: at every edge of one triangle alone, also where neighbours are divided otherwise.
+    """
     if not len(mesh):
         return mesh
     corners = mesh.vertices[mesh.triangles]
-    ends = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
-    grid = np.rint(ends[:, :, :2] / _GRID_M).astype(np.int64)
+    edges = np.concatenate([corners[:, [0, 1]], corners[:, [1, 2]], corners[:, [2, 0]]])
+    grid = np.rint(edges[:, :, :2] / _GRID_M).astype(np.int64)
     one, two = (np.ascontiguousarray(grid[:, i]).view("i8,i8").ravel() for i in (0, 1))
     order = {(a, b): k for k, (a, b) in enumerate(zip(one.tolist(), two.tolist(), strict=True))}
-    alone = ends[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
+    alone = edges[[k for (a, b), k in order.items() if (b, a) not in order and a != b]]
+    if ends is not None and len(alone):
+        alone = alone[shapely.dwithin(shapely.points(alone[:, :, :2].mean(axis=1)), ends, _AT_END_M)]
     if not len(alone):
         return mesh
     under = alone - np.array([0.0, 0.0, _LIFT_M])

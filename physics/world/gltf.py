@@ -67,7 +67,7 @@ class _Parts:
 
     def add_square(self, surface: Surface, key: Key) -> None:
         chunk, finish = surface.chunk(key), surface.finish(key)
-        for patch in (*chunk.ground, *finish.laid, *surface.covers(key), *finish.painted):
+        for patch in (*chunk.ground, *finish.laid, *finish.painted):
             self.add("surfaces", patch.name, patch.mesh, self._shown(patch))
         for facade, mesh in facade_meshes(chunk.buildings).items():
             name, colour = ("windows", WINDOW_COLOUR) if facade < 0 else ("walls", FACADES[facade])

@@ -4,8 +4,9 @@ the bit."""
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -16,11 +17,11 @@ import cosim
 import physics
 from cosim.core.baked import Arrays, sources_hash
 from cosim.core.pieces import Pieces
-from cosim.place.street_map import StreetMap
+from cosim.place.street_map import LandKind, StreetMap
 from cosim.place.terrain import Terrain
 from physics.street.buildings import Building
 from physics.street.furniture import Prop
-from physics.world.mesh import Mesh
+from physics.world.mesh import EMPTY, Mesh
 from physics.world.relief import Relief
 from physics.world.tiles import Key, Tile
 
@@ -29,6 +30,7 @@ _ROOMS: Final = (
     *(Path(physics.__file__).parent / room for room in ("world", "street", "textures", "cameras/gl")),
 )
 _MADE_BY: Final = f"{sources_hash(*_ROOMS)} {shapely.geos_version_string}"
+_Name = TypeVar("_Name", bound=str)
 
 
 class TileThings(msgspec.Struct, frozen=True, array_like=True):
@@ -56,31 +58,21 @@ def pieces_of(street_map: StreetMap, seed: int, roughness: float) -> Pieces:
 
 def tile_as_arrays(tile: Tile) -> Arrays:
     """For `tile_of_arrays`."""
-    meshes, relief = tile.parts.values(), tile.relief
+    relief = tile.relief
     words = _Ground(
-        [(name, len(mesh.vertices), len(mesh)) for name, mesh in tile.parts.items()],
+        _rows(tile.parts),
         shapely.to_wkb(tile.low),
         shapely.to_wkb(tile.crossings),
         None if relief is None else (relief.roughness, relief.seed),
     )
-    found = {
-        "words": _as_array(words),
-        "vertices": np.concatenate([mesh.vertices for mesh in meshes]),
-        "normals": np.concatenate([mesh.normals for mesh in meshes]),
-        "triangles": np.concatenate([mesh.triangles for mesh in meshes]),
-    }
+    found = {"words": _as_array(words), **_joined_parts(tile.parts)}
     return found if relief is None else found | {"roots": relief.roots, "holes": relief.holes}
 
 
 def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
     """The tile again."""
     words = msgspec.msgpack.decode(held["words"].data, type=_Ground)
-    parts, corner, triangle = {}, 0, 0
-    for name, corners, triangles in words.parts:
-        here = slice(corner, corner + corners)
-        faces = held["triangles"][triangle : triangle + triangles]
-        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
-        corner, triangle = corner + corners, triangle + triangles
+    parts = _parts_of(words.parts, held)
     low, crossings = shapely.from_wkb([words.low, words.crossings])
     shapely.prepare([low, crossings])
     relief = None
@@ -88,6 +80,41 @@ def tile_of_arrays(held: Arrays, key: Key, terrain: Terrain | None) -> Tile:
         roughness, seed = words.relief
         relief = Relief(roughness, seed, held["roots"], held["holes"])
     return Tile(key, parts, low, crossings, relief, terrain)
+
+
+def covers_as_arrays(covers: Mapping[LandKind, Mesh]) -> Arrays:
+    """For `covers_of_arrays`."""
+    words = np.frombuffer(msgspec.msgpack.encode(_rows(covers)), dtype=np.uint8)
+    return {"words": words, **_joined_parts(covers)}
+
+
+def covers_of_arrays(held: Arrays) -> dict[LandKind, Mesh]:
+    """The covers again."""
+    return _parts_of(msgspec.msgpack.decode(held["words"].data, type=list[tuple[LandKind, int, int]]), held)
+
+
+def _rows(parts: Mapping[_Name, Mesh]) -> list[tuple[_Name, int, int]]:
+    """Names of meshes, with how many vertices and triangles they have."""
+    return [(name, len(mesh.vertices), len(mesh)) for name, mesh in parts.items()]
+
+
+def _joined_parts(parts: Mapping[_Name, Mesh]) -> dict[str, NDArray[Any]]:
+    meshes = [*parts.values(), EMPTY]
+    return {
+        "vertices": np.concatenate([mesh.vertices for mesh in meshes]),
+        "normals": np.concatenate([mesh.normals for mesh in meshes]),
+        "triangles": np.concatenate([mesh.triangles for mesh in meshes]),
+    }
+
+
+def _parts_of(rows: Sequence[tuple[_Name, int, int]], held: Arrays) -> dict[_Name, Mesh]:
+    parts, corner, triangle = {}, 0, 0
+    for name, corners, triangles in rows:
+        here = slice(corner, corner + corners)
+        faces = held["triangles"][triangle : triangle + triangles]
+        parts[name] = Mesh(held["vertices"][here], held["normals"][here], faces)
+        corner, triangle = corner + corners, triangle + triangles
+    return parts
 
 
 def things_as_arrays(things: TileThings) -> Arrays:

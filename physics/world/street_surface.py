@@ -4,7 +4,7 @@ and kept for all its processes."""
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 import numpy as np
@@ -15,7 +15,7 @@ from cosim.core.baked import Arrays
 from cosim.core.errors import UsageError
 from cosim.core.geometry import Floats
 from cosim.place.open_ground import GROUND_LOOKS
-from cosim.place.street_map import StreetMap
+from cosim.place.street_map import LandKind, StreetMap
 from physics.street.buildings import Building, Frontage, on_land
 from physics.street.covers import covers_in
 from physics.street.frontage import frontage_in
@@ -28,6 +28,8 @@ from physics.street.props import SignalPost, posts_in
 from physics.textures.ground import layer_of
 from physics.world.kept_tiles import (
     TileThings,
+    covers_as_arrays,
+    covers_of_arrays,
     pieces_of,
     things_as_arrays,
     things_of_arrays,
@@ -73,8 +75,16 @@ class StreetSurface(Surface):
         return Patch(name, mesh, friction(name), label, colour, layer_of(shown, self.seed), name in PAVINGS)
 
     def covers(self, key: Key) -> tuple[Patch, ...]:
+        if self.street_map.planned:
+            return ()
+        held = self.kept(
+            "covers", key, lambda: covers_as_arrays(covers_in(self.street_map, self.tile(key), rims=False))
+        )
+        return self._looking(covers_of_arrays(held))
+
+    def _looking(self, covers: Mapping[LandKind, Mesh]) -> tuple[Patch, ...]:
         laid = []
-        for kind, mesh in covers_in(self.street_map, self.tile(key)):
+        for kind, mesh in covers.items():
             name, colour = f"ground:{kind}", GROUND_LOOKS[kind].seen
             laid.append(Patch(name, mesh, PLAIN_FRICTION, "ground", colour, layer_of(name, self.seed)))
         return tuple(laid)
@@ -83,7 +93,8 @@ class StreetSurface(Surface):
         return posts_in(self.street_map, key)
 
     def finish(self, key: Key) -> Finish:
-        tile, laid, painted = self.tile(key), [], []
+        tile, painted = self.tile(key), []
+        laid = [*self._looking(covers_in(self.street_map, tile, rims=True))]
         for mesh, (layer, colour) in frontage_in(self.street_map, tile, self.seed):
             tint = colour or (1.0, 1.0, 1.0)
             laid.append(Patch(f"ground:{layer}", mesh, PLAIN_FRICTION, "ground", tint, layer, colour is not None))

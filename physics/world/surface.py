@@ -83,7 +83,7 @@ class Surface(ABC):
         return []
 
     def covers(self, key: Key) -> tuple[Patch, ...]:
-        """Thin covers on the ground of a square, shown by every camera, touched by nothing."""
+        """Thin covers on the ground of a square, for cameras that show no finish, which has them too."""
         return ()
 
     def finish(self, key: Key) -> Finish:

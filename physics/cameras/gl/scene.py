@@ -214,9 +214,8 @@ class GlScene:
         """What of a tile hangs on its surface alone."""
         middle = _middle(key)
         chunk, finish, posts = self._surface.chunk(key), self._surface.finish(key), self._surface.posts(key)
-        laid = (*finish.laid, *self._surface.covers(key))
         layers = {
-            "ground": ground_rows(self._surfaces, (*laid, *chunk.ground), middle),
+            "ground": ground_rows(self._surfaces, (*finish.laid, *chunk.ground), middle),
             "paint": ground_rows(self._surfaces, finish.painted, middle),
             "walls": wall_rows(self._surfaces, chunk.buildings, finish.styles, middle),
         }
