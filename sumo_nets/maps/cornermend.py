@@ -15,6 +15,7 @@ import shapely
 from shapely.geometry import MultiPolygon, Polygon
 
 from cosim.core.geometry import Floats
+from cosim.core.telling import Tell, untold
 from cosim.place import overlay
 from cosim.place.street_map import SEAM_M, Corner, Port, StreetMap, Strip, union_closed
 
@@ -26,11 +27,13 @@ _WIDEST_M = 2.0
 _EDGE_M = 0.05
 
 
-def mend_corners(root: ET.Element, street_map: StreetMap) -> list[str]:
+def mend_corners(root: ET.Element, street_map: StreetMap, tell: Tell = untold) -> list[str]:
     """Widen, in place, the walking areas through which a robot could not pass. What was changed, a sentence."""
     lanes = {e.get("id"): e[0] for e in root.iter("edge") if e.get("function") == "walkingarea" and len(e)}
     mended = 0
-    for corner in street_map.corners.values():
+    for number, corner in enumerate(street_map.corners.values()):
+        if number % 100 == 0:
+            tell("mending corners", number / len(street_map.corners))
         polygon = passable(street_map, corner)
         if polygon is not None and corner.id in lanes:
             ring = shapely.get_coordinates(polygon.exterior)[:-1]

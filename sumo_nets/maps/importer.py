@@ -8,16 +8,15 @@ from __future__ import annotations
 import math
 import re
 import shutil
-import subprocess
-import xml.etree.ElementTree as ET
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 import shapely
 
-from cosim.core.errors import MachineError, MapError, UsageError
+from cosim.core.errors import MapError, UsageError
+from cosim.core.telling import Tell, untold
 from cosim.place.map_check import NetFacts
 from cosim.place.overlay import where_geos_failed
 from cosim.place.street_map import Feature
@@ -26,6 +25,15 @@ from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.featurefit import fitted
 from sumo_nets.maps.importrules import NEWEST_RULES, Rules
 from sumo_nets.maps.levels import LEVEL_KEYS, edges_of
+from sumo_nets.maps.netsteps import (
+    ImportWork,
+    add_walkways,
+    crop_net,
+    start_sumo,
+    sumo_home,
+    widen_sidewalks,
+)
+from sumo_nets.maps.osmcrop import Box
 from sumo_nets.maps.osmfeatures import osm_features
 from sumo_nets.maps.osmfile import MapFile, OsmFacts, osm_facts, unpacked
 from sumo_nets.maps.sidewalks import (
@@ -33,16 +41,10 @@ from sumo_nets.maps.sidewalks import (
     WIDTH_LIMITS_M,
     new_share,
     pavements,
-    set_widths,
     untagged_share,
 )
-from sumo_nets.net.netconvert import complaints, netconvert
-from sumo_nets.net.netfacts import allows, facts_of, net_root, read_facts
+from sumo_nets.net.netfacts import facts_of, net_root, read_facts
 from sumo_nets.net.netfile import read_net
-
-TIMEOUT_S = 300.0
-START_TIMEOUT_S = 60.0
-_Box = tuple[float, float, float, float]
 
 TYPES = ("osmNetconvert.typ.xml", "osmNetconvertUrbanDe.typ.xml", "osmNetconvertPedestrians.typ.xml")
 OSM_OPTIONS = (
@@ -64,10 +66,8 @@ OSM_OPTIONS = (
     "--osm.all-attributes",
     f"--osm.extra-attributes={','.join(LEVEL_KEYS)}",
 )
-UPGRADE_OPTIONS = ("--sidewalks.guess", "--crossings.guess", "--walkingareas")
-FOOT_TYPES = ("highway.footway", "highway.pedestrian", "highway.steps", "highway.path")
-FOOT_MPS = 1.4
-"""An edge of one lane that is as slow as this is a footway, whatever the net lets drive on it."""
+BIG = 10_000
+"""With more streets and paths than this an import takes minutes."""
 OSM_LICENCE = (
     "Map data (c) OpenStreetMap contributors, Open Database License (ODbL) 1.0: credit them on what is shown, "
     "and offer the net, a derived database, under the ODbL. https://www.openstreetmap.org/copyright"
@@ -85,7 +85,7 @@ class Options:
     rules: the version of the importer.
     """
 
-    bbox: _Box | None = None
+    bbox: Box | None = None
     lefthand: bool | None = None
     as_is: bool = False
     sidewalk_width_m: float | None = None
@@ -130,73 +130,81 @@ class Converted:
     licences: tuple[str, ...]
 
 
-def convert(source: Path, folder: Path, options: Options) -> Converted:
+def convert(source: Path, folder: Path, options: Options, tell: Tell = untold) -> Converted:
     """`source` as a net in the scratch `folder`. Raises MapError naming what was found and what to do."""
-    file = unpacked(source, folder)
-    changes = [f"unpacked ({file.packing})"] if file.packing else []
+    tell(f"reading {source.name}")
+    file = unpacked(source, folder, options.bbox)
+    work = ImportWork(file, folder, tell, [f"unpacked ({file.packing})"] if file.packing else [])
     with _told_of(file):
-        if file.format == "osm":
-            return _from_osm(file, folder, options, changes)
-        return _from_net(file, folder, options, changes)
+        return _from_osm(work, options) if file.format == "osm" else _from_net(work, options)
 
 
-def _from_osm(file: MapFile, folder: Path, options: Options, changes: list[str]) -> Converted:
-    found = osm_facts(file)
+def _from_osm(work: ImportWork, options: Options) -> Converted:
+    file, changes = work.file, work.changes
     if options.as_is:
         raise UsageError(
             f"{file.source}: --as-is is for SUMO nets; an OpenStreetMap file is always converted: leave --as-is out"
         )
+    found = osm_facts(file)
     extra = ["--lefthand"] if _left_hand(found, options, changes) else []
     # Joined to a street on the ground, a bridge would take all of the street off the ground.
-    apart = folder / "apart.txt"
+    apart = work.folder / "apart.txt"
     apart.write_text("\n".join(edges_of(found.levelled)))
     extra.append(f"--geometry.remove.keep-edges.input-file={apart}")
-    types = ",".join(str(_sumo_home() / "data" / "typemap" / name) for name in TYPES)
-    net = _netconvert(
-        folder, "full.net.xml", ["--osm-files", str(file.path), "--type-files", types, *OSM_OPTIONS, *extra]
-    )
-    net = _crop(file, folder, net, options.bbox, changes)
+    types = ",".join(str(sumo_home() / "data" / "typemap" / name) for name in TYPES)
+    arguments = ["--osm-files", str(file.path), "--type-files", types, *OSM_OPTIONS, *extra]
+    stage = _converting(found.roads + found.ways_on_foot, options)
+    net = work.netconvert(stage, "full.net.xml", arguments)
+    net = crop_net(work, net, options.bbox)
     changes.append(
         f"converted {found.roads} roads and {found.ways_on_foot} paths; crossings are guessed wherever pavements "
         "meet a road; railways and isolated streets left out, junctions and signals close together joined"
     )
-    net = _widened(folder, net, options, found.widths, frozenset(), changes)
+    net = widen_sidewalks(work, net, options.widths_m, found.widths)
     share = untagged_share(net_root(net), found.tagged)
     if share:
         changes.append(f"guessed {share:.0%} of the pavement's length: the file does not speak of it")
     licences = [OSM_LICENCE, found.licence] if found.licence else [OSM_LICENCE]
-    return _finish(file, net, options.rules, changes, share, licences)
+    return _finish(work, net, options.rules, share, licences)
 
 
-def _from_net(file: MapFile, folder: Path, options: Options, changes: list[str]) -> Converted:
+def _converting(streets: int, options: Options) -> str:
+    """The stage of a conversion, with advice where it takes minutes."""
+    advice = " (--bbox west,south,east,north: a part is faster)" if streets > BIG and options.bbox is None else ""
+    return f"converting {streets} streets and paths{advice}"
+
+
+def _from_net(work: ImportWork, options: Options) -> Converted:
+    file, changes = work.file, work.changes
     facts = read_facts(file.path) if options.lefthand is None else _sided(read_facts(file.path), options, file)
     if not facts.edges:
         raise MapError(f"{file.source}: a net of 0 edges: export an area with streets in it")
-    net = file.path
-    before = frozenset(pavements(net_root(net)))
-    net = _crop(file, folder, net, options.bbox, changes)
+    if facts.edges > BIG:
+        work.tell(_converting(facts.edges, options))
+    before = frozenset(pavements(net_root(file.path)))
+    net = crop_net(work, file.path, options.bbox)
     if options.as_is:
-        return _unchanged(file, net, facts, changes)
+        return _unchanged(work, net, facts)
     share: float | None = None
     if _lacks_walkways(facts):
-        net = _upgraded(folder, net, facts, changes)
-        net = _widened(folder, net, options, {}, before, changes)
+        net = add_walkways(work, net, facts)
+        net = widen_sidewalks(work, net, options.widths_m, {}, before)
         share = new_share(net_root(net), before)
     elif _old(facts.version):
-        net = _netconvert(folder, "renewed.net.xml", ["-s", str(net)])
+        net = work.netconvert("renewing the net", "renewed.net.xml", ["-s", str(net)])
         changes.append(f"renewed by netconvert: format {facts.version} is too old to be simulated")
-    return _finish(file, net, options.rules, changes, share, [])
+    return _finish(work, net, options.rules, share, [])
 
 
 def _lacks_walkways(facts: NetFacts) -> bool:
     return not facts.areas or facts.pavement_km + facts.shared_km == 0.0
 
 
-def _unchanged(file: MapFile, net: Path, facts: NetFacts, changes: list[str]) -> Converted:
+def _unchanged(work: ImportWork, net: Path, facts: NetFacts) -> Converted:
     """The net as it is, with what is not possible on it. Raises MapError when SUMO does not start on it."""
-    final = net.with_name("final.net.xml")
+    file, changes, final = work.file, work.changes, net.with_name("final.net.xml")
     shutil.copyfile(net, final)
-    _start_sumo(file, final)
+    start_sumo(file, final)
     if _lacks_walkways(facts):
         km = facts.pavement_km + facts.shared_km
         changes.append(
@@ -208,19 +216,20 @@ def _unchanged(file: MapFile, net: Path, facts: NetFacts, changes: list[str]) ->
     return Converted(final, facts, (), file.format, file.packing, tuple(changes), None, ())
 
 
-def _finish(
-    file: MapFile, net: Path, rules: Rules, changes: list[str], share: float | None, licences: list[str]
-) -> Converted:
+def _finish(work: ImportWork, net: Path, rules: Rules, share: float | None, licences: list[str]) -> Converted:
     """Mend what can be mended, then prove that the net holds walkways and that SUMO starts on it."""
-    final, root = net.with_name("final.net.xml"), net_root(net)
+    file, changes, tell = work.file, work.changes, work.tell
+    tell("reading the net")
+    root = net_root(net)
     for mend in rules.mends:
         changes += mend(root)
-    ET.ElementTree(root).write(final, encoding="UTF-8", xml_declaration=True)
+    final = work.written(root, "final.net.xml")
     facts = facts_of(root)
     street_map = read_net(final)
-    if mended := mend_corners(root, street_map):
+    if mended := mend_corners(root, street_map, tell):
         changes += mended
-        ET.ElementTree(root).write(final, encoding="UTF-8", xml_declaration=True)
+        work.written(root, "final.net.xml")
+        tell("reading the net")
         street_map = read_net(final)
     if not any(strip.kind == "sidewalk" for strip in street_map.strips.values()):
         raise MapError(
@@ -231,9 +240,11 @@ def _finish(
         raise MapError(f"{file.source}: its sidewalks are not connected: it has no walking areas; import a larger area")
     if facts.twisted_areas:
         changes.append(f"{facts.twisted_areas} of {facts.areas} walking areas cross themselves: repaired when read")
-    _start_sumo(file, final)
+    tell("starting SUMO on the net")
+    start_sumo(file, final)
     features: tuple[Feature, ...] = ()
     if file.format == "osm":
+        tell("placing buildings and things")
         location = root.find("location")
         features, told = fitted(osm_features(file), {} if location is None else location.attrib, street_map)
         changes += told
@@ -263,102 +274,8 @@ def _sided(facts: NetFacts, options: Options, file: MapFile) -> NetFacts:
     return facts
 
 
-def _crop(file: MapFile, folder: Path, net: Path, bbox: _Box | None, changes: list[str]) -> Path:
-    """The net inside a box, in two calls: both wishes in one keep netconvert busy for ever on some nets."""
-    if bbox is None:
-        return net
-    projected = read_facts(net).projected
-    option = "--keep-edges.in-geo-boundary" if projected else "--keep-edges.in-boundary"
-    box = ",".join(f"{v:.7f}" for v in bbox)
-    try:
-        inside = _netconvert(folder, "inside.net.xml", ["-s", str(net), f"{option}={box}"])
-        net = _netconvert(folder, "cropped.net.xml", ["-s", str(inside), "--keep-edges.components=1"])
-    except MapError as error:
-        x0, y0, x1, y1 = read_net(net).bounds
-        units = "longitude and latitude" if projected else "metres: this net has no projection"
-        raise MapError(
-            f"{file.source}: cropping to {box} failed (bbox is in {units}; the whole map is {x1 - x0:.0f} x "
-            f"{y1 - y0:.0f} m): {error}"
-        ) from error
-    changes.append(f"cropped to {box}; whole streets are kept, and only the largest connected part")
-    return net
-
-
-def _widened(
-    folder: Path,
-    net: Path,
-    options: Options,
-    tagged: Mapping[str, Mapping[str, str]],
-    before: Collection[str],
-    changes: list[str],
-) -> Path:
-    """The net with the widths of guessed sidewalks set, see `set_widths`."""
-    root = net_root(net)
-    said = set_widths(root, options.widths_m, tagged, before)
-    if not said:
-        return net
-    changes += said
-    ready = folder / "widths.net.xml"
-    ET.ElementTree(root).write(ready, encoding="UTF-8", xml_declaration=True)
-    return _netconvert(folder, "widened.net.xml", ["-s", str(ready)])
-
-
-def _upgraded(folder: Path, net: Path, facts: NetFacts, changes: list[str]) -> Path:
-    """The net with sidewalks beside slow roads, crossings and walking areas."""
-    root = net_root(net)
-    freed = 0
-    for edge in root.iter("edge"):
-        lanes = edge.findall("lane")
-        if len(lanes) == 1 and not edge.get("function") and allows(lanes[0], "pedestrian") and _is_footway(edge):
-            freed += allows(lanes[0], "passenger")
-            lanes[0].attrib.pop("disallow", None)
-            lanes[0].set("allow", "pedestrian")
-    ready = folder / "ready.net.xml"
-    ET.ElementTree(root).write(ready, encoding="UTF-8", xml_declaration=True)
-    # --tls.guess would invent signals, some of which SUMO then refuses.
-    upgraded = _netconvert(folder, "upgraded.net.xml", ["-s", str(ready), *UPGRADE_OPTIONS])
-    if freed:
-        changes.append(f"{freed} footways on which cars were allowed are for people only")
-    changes.append(
-        f"sidewalks beside every road up to 50 km/h, crossings and walking areas added (format was {facts.version}): "
-        "lanes are renumbered, junctions grew; bus stops and detectors made for the old net do not fit any more"
-    )
-    return upgraded
-
-
-def _is_footway(edge: ET.Element) -> bool:
-    slow = float(edge[0].get("speed", "13.9")) <= FOOT_MPS
-    return slow or edge.get("type", "") in FOOT_TYPES
-
-
 def _old(version: str) -> bool:
     return version.startswith("0.") or version == "?"
-
-
-def _netconvert(folder: Path, name: str, arguments: Sequence[str]) -> Path:
-    return netconvert(arguments, folder / name, TIMEOUT_S)
-
-
-def _start_sumo(file: MapFile, net: Path) -> None:
-    """Start SUMO on the net for a second: some nets that netconvert is content with are refused by it."""
-    command = [str(_sumo_home() / "bin" / "sumo"), "-n", str(net), "-e", "1", "--no-step-log", "--no-warnings"]
-    try:
-        done = subprocess.run(
-            command, capture_output=True, text=True, errors="replace", timeout=START_TIMEOUT_S, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise MapError(f"{file.source}: SUMO did not start on the net within {START_TIMEOUT_S:g} s") from error
-    except OSError as error:
-        raise MachineError(f"sumo cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
-    if done.returncode != 0:
-        ended = f"(sumo -n NET -e 1 ends with {done.returncode})"
-        raise MapError(f"{file.source}: SUMO refuses the net {ended}{complaints(done.stderr)}")
-
-
-def _sumo_home() -> Path:
-    import sumo
-
-    return Path(sumo.__file__).parent
 
 
 @contextmanager
@@ -381,6 +298,7 @@ def _told_of(file: MapFile) -> Iterator[None]:
 def _retold(file: MapFile, words: str) -> str:
     words = re.sub(rf"^{re.escape(str(file.path.parent))}/\S+?: ", "", words)
     words = words.rstrip(".").replace(str(file.path), str(file.source)).replace(f"{file.path.parent}/", "")
+    words = words.replace("cut the area of interest out first", "import a part of it with --bbox")
     if "without any edge" in words or "No nodes loaded" in words:
         words += "; no street of the file survived the conversion: import a larger area, with whole streets in it"
     return words if words.startswith(f"{file.source}: ") else f"{file.source}: {words}"

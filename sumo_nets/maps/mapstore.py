@@ -15,6 +15,7 @@ import msgspec
 
 from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
+from cosim.core.telling import Tell, untold
 from cosim.place.map_check import MapCheck, check_map
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import CityMap
@@ -71,7 +72,7 @@ def maps_folder() -> Path:
     return cache_folder() / "maps"
 
 
-def import_map(source: Path, name: str | None = None, options: Options | None = None) -> About:
+def import_map(source: Path, name: str | None = None, options: Options | None = None, tell: Tell = untold) -> About:
     """Import a map file under a name (by default the file's), in place of an earlier one of that name.
 
     Raises MapError when the file makes no usable net, UsageError for an unusable name; then nothing is kept.
@@ -84,7 +85,7 @@ def import_map(source: Path, name: str | None = None, options: Options | None = 
         if source != _supplied()[name] or options != Options():
             raise UsageError(f"'{name}' is the name of a net that comes with SUMO: choose another with --name")
         options = _options_of(name)
-    return _keep(source, name, options)
+    return _keep(source, name, options, tell)
 
 
 def map_name(source: Path) -> str:
@@ -186,12 +187,12 @@ def _source_of(name: str) -> str:
         return "damaged: import it again"
 
 
-def _keep(source: Path, name: str, options: Options, *, in_place: bool = True) -> About:
+def _keep(source: Path, name: str, options: Options, tell: Tell = untold, *, in_place: bool = True) -> About:
     """Convert in a scratch folder beside the finished maps, then move the whole into place."""
     folder = maps_folder()
     try:
         with scratch_in(folder) as scratch:
-            made = convert(source, scratch, options)
+            made = convert(source, scratch, options, tell)
             ready = scratch / "ready"
             ready.mkdir()
             made.net.rename(ready / "net.xml")

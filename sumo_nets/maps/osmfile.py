@@ -17,6 +17,7 @@ import numpy as np
 
 from cosim.core.errors import MapError
 from sumo_nets.maps.levels import is_levelled
+from sumo_nets.maps.osmcrop import Box, crop_osm
 from sumo_nets.maps.rawfile import BLANK, LARGEST_BYTES, head_of, parse, pour, root_of
 
 READABLE = "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can be read"
@@ -61,19 +62,29 @@ class OsmFacts:
     licence: str
 
 
-def unpacked(source: Path, folder: Path) -> MapFile:
-    """`source` as plain XML inside `folder`. Raises MapError naming what was found when it is no map."""
+def unpacked(source: Path, folder: Path, box: Box | None = None) -> MapFile:
+    """`source` as plain XML inside `folder`. Raises MapError naming what was found when it is no map.
+
+    box: of an OpenStreetMap file the part to keep, see `crop_osm`.
+    """
     head = head_of(source)
     if not head:
         raise MapError(f"{source}: the file is empty; {READABLE}")
     packing, plain = _packing(source, head), folder / "unpacked.xml"
-    if packing == "PBF":
-        _pbf(source, plain)
-    else:
+    if packing != "PBF":
         pour(source, packing, plain)
-    kind = _kind(source, plain)
+    elif box is None:
+        _pbf(source, plain)
+    kind = "osm" if packing == "PBF" and box is not None else _kind(source, plain)
     path = folder / ("input.net.xml" if kind == "net" else "input.osm")
-    plain.rename(path)
+    if box is None or kind == "net":
+        plain.rename(path)
+    elif packing == "PBF":
+        crop_osm(source, path, box, source)
+    else:
+        whole = plain.rename(folder / "whole.osm")
+        crop_osm(whole, path, box, source)
+        whole.unlink()
     return MapFile(source, path, kind, packing)
 
 
@@ -102,7 +113,7 @@ def _pbf(source: Path, target: Path) -> None:
     except (OSError, RuntimeError, ValueError) as error:
         raise MapError(f"{source}: cannot be unpacked (PBF): {error}: get it again") from error
     if osm.stat().st_size > LARGEST_BYTES:
-        raise MapError(f"{source}: more than {LARGEST_BYTES >> 30} GiB unpacked: cut the area of interest out first")
+        raise MapError(f"{source}: more than {LARGEST_BYTES >> 30} GiB unpacked: import a part of it with --bbox")
     osm.rename(target)
 
 

@@ -2,41 +2,89 @@
 
 from __future__ import annotations
 
+import os
+import selectors
 import subprocess
-from collections.abc import Sequence
+import tempfile
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Final
 
 from cosim.core.errors import MachineError, MapError
 
 WORDS = 400
 """So many letters of netconvert's complaints are told."""
+_STAGES: Final = (
+    (b"Parsing nodes", 0.0),
+    (b"Parsing edges", 0.02),
+    (b"Removing self-loops", 0.11),
+    (b"Joining junction clusters", 0.23),
+    (b"Moving network to origin", 0.27),
+    (b"Guessing and setting on-/off-ramps", 0.34),
+    (b"Computing node shapes", 0.41),
+    (b"Computing edge shapes", 0.48),
+    (b"Computing priorities", 0.53),
+    (b"Computing approaching lanes", 0.55),
+    (b"Rechecking of lane endings", 0.59),
+    (b"Computing node logics", 0.64),
+    (b"Building inner edges", 0.66),
+    (b"Writing network", 0.75),
+)
+"""Words of netconvert at the begin of its stages, and the share of its time that is over then, measured on a city."""
 
 
-def netconvert(arguments: Sequence[str], output: Path, timeout_s: float = 120.0) -> Path:
-    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it cannot be run."""
+def netconvert(
+    arguments: Sequence[str],
+    output: Path,
+    timeout_s: float = 120.0,
+    progress: Callable[[float], None] | None = None,
+) -> Path:
+    """Run netconvert to make `output`. Raises MapError with its complaints, MachineError when it cannot be run.
+
+    progress: called with the share that is done, 0 to 1, whenever netconvert begins a stage.
+    """
     import sumo
 
     command = [str(Path(sumo.__file__).parent / "bin" / "netconvert"), *arguments, "-o", str(output)]
     try:
-        done = subprocess.run(
-            command,
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            errors="replace",
-            timeout=timeout_s,
-            check=False,
-        )
+        returncode, said = _run(command if progress is None else [*command, "--verbose"], timeout_s, progress)
     except subprocess.TimeoutExpired as error:
         raise MapError(f"netconvert did not end within {timeout_s:g} s: cut the area of interest out first") from error
     except OSError as error:
         raise MachineError(f"netconvert cannot be run: {error.strerror}: is eclipse-sumo installed?") from error
-    if done.returncode != 0 or not output.exists():
-        raise MapError(f"netconvert failed with exit code {done.returncode}{complaints(done.stderr)}")
+    if returncode != 0 or not output.exists():
+        raise MapError(f"netconvert failed with exit code {returncode}{complaints(said)}")
     # An exit code of 0 is no proof: an empty net ends in "Success" too.
     if b"<edge " not in output.read_bytes():
-        raise MapError(f"netconvert made a net without any edge{complaints(done.stderr)}")
+        raise MapError(f"netconvert made a net without any edge{complaints(said)}")
     return output
+
+
+def _run(command: Sequence[str], timeout_s: float, progress: Callable[[float], None] | None) -> tuple[int, str]:
+    """Run a command to its end. Returns its exit code and what it wrote to standard error."""
+    began = time.monotonic()
+    with tempfile.TemporaryFile() as errors, selectors.DefaultSelector() as ready:
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors) as process:
+            assert process.stdout is not None
+            ready.register(process.stdout, selectors.EVENT_READ)
+            said = b""
+            try:
+                while ready.select(max(began + timeout_s - time.monotonic(), 0.0)):
+                    piece = os.read(process.stdout.fileno(), 1 << 16)
+                    if not piece:
+                        break
+                    # A stage's words may come in two pieces.
+                    said = said[-80:] + piece
+                    begun = [share for words, share in _STAGES if words in said]
+                    if progress is not None and begun:
+                        progress(max(begun))
+                process.wait(max(began + timeout_s - time.monotonic(), 0.0))
+            except BaseException:
+                process.kill()
+                raise
+        errors.seek(0)
+        return process.returncode, errors.read().decode(errors="replace")
 
 
 def complaints(said: str) -> str:

@@ -18,11 +18,11 @@ from hypothesis import strategies as st
 from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, UsageError
 from cosim.place.route_line import through_corner
-from cosim.place.street_map import Port
+from cosim.place.street_map import Port, StreetMap
 from cosim.spec.scenario import City, CityMap
 from scenarios.catalog import load_suite
 from sumo_nets.city.store import build_city
-from sumo_nets.maps import importer
+from sumo_nets.maps import importer, netsteps, osmcrop
 from sumo_nets.maps.cornermend import mend_corners
 from sumo_nets.maps.drivingside import left_hand_country
 from sumo_nets.maps.importer import Options
@@ -254,18 +254,71 @@ def test_maps_of_an_older_importer_stay_usable(tmp_path: Path) -> None:
     assert street_map.strips and outdated(about) and not outdated(import_map(source, "old"))
 
 
+class Stages:
+    """What an import says of itself: its stages, and the shares of each."""
+
+    def __init__(self) -> None:
+        self.shares: dict[str, list[float]] = {}
+
+    def __call__(self, stage: str, share: float | None = None, /) -> None:
+        self.shares.setdefault(stage, []).extend([] if share is None else [share])
+
+
 @pytest.mark.engine
-def test_bbox_keeps_a_part(tmp_path: Path) -> None:
-    """A box keeps the streets in it, and only those; a box elsewhere is refused."""
-    source, (lon, lat) = written(tmp_path / "town.osm", osm()), BERLIN
-    import_map(source, "whole")
-    import_map(source, "part", Options(bbox=(lon - 0.001, lat - 0.001, lon + 0.002, lat + 0.0015)))
-    whole, part = read_map("whole"), read_map("part")
-    assert 0 < len(part.strips) < len(whole.strips) / 2
-    before = kept()
-    with pytest.raises(MapError, match="cropping to"):
-        import_map(source, "elsewhere", Options(bbox=(1.0, 1.0, 2.0, 2.0)))
+def test_a_box_is_cut_out_before_the_conversion(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a packed file only the streets in the box and its margin are converted, and the part is that of the whole."""
+    monkeypatch.setattr(osmcrop, "MARGIN_M", 130.0)
+    (lon, lat), told = BERLIN, Stages()
+    plain = written(tmp_path / "town.osm", osm(blocks=5))
+    source = tmp_path / "town.osm.gz"
+    source.write_bytes(gzip.compress(plain.read_bytes()))
+    box = (lon + 0.0001, lat + 0.0001, lon + 0.0018, lat + 0.0012)
+    about = import_map(source, "part", Options(bbox=box), told)
+    stages = list(told.shares)
+    assert stages[0] == "reading town.osm.gz" and stages[1] == "converting 8 streets and paths"
+    assert set(stages) >= {"cropping", "widening sidewalks", "mending corners", "starting SUMO on the net"}
+    done = told.shares["converting 8 streets and paths"]
+    assert done == sorted(done) and done[0] == 0.0 and done[-1] > 0.7
+    part = set(read_map("part").strips)
+    assert about.bbox == box and 10 < len(part) < 60 and part == set(cut_afterwards(plain, box).strips)
+
+
+def cut_afterwards(source: Path, box: tuple[float, float, float, float]) -> StreetMap:
+    """The part of a town that is converted whole and then cropped."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(osmcrop, "MARGIN_M", 1e6)
+        import_map(source, "afterwards", Options(bbox=box))
+    return read_map("afterwards")
+
+
+@pytest.mark.engine
+def test_a_bad_box_is_refused_with_the_bounds(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box outside of a file, with its sides swapped, or without a street: the error gives the file's bounds."""
+    monkeypatch.setattr(osmcrop, "MARGIN_M", 1.0)
+    source, before = written(tmp_path / "town.osm", osm()), kept()
+    done = cosim("map", "import", str(source), "--bbox", "1,1,2,2")
+    assert done.returncode == 2 and "is outside of the map, which covers 13.4,52.5,13.4051,52.5033" in done.stderr
+    with pytest.raises(MapError, match=r"swapped\? --bbox 13.4,52.5,13.401,52.501\)"):
+        import_map(source, "swapped", Options(bbox=(52.5, 13.4, 52.501, 13.401)))
+    with pytest.raises(MapError, match=r"no street or path .* lies in --bbox .*; the file covers 13\.4,52\.5,"):
+        import_map(source, "empty", Options(bbox=(13.4005, 52.5003, 13.4006, 52.5004)))
+    net = netconvert(["--osm-files", str(source)], tmp_path / "projected.net.xml")
+    with pytest.raises(MapError, match=r"outside of the map, which covers 13\.4,52\.5,.* in degrees\)"):
+        import_map(net, options=Options(bbox=(1.0, 1.0, 2.0, 2.0)))
+    flat = tmp_path / "flat.net.xml"
+    flat.write_bytes(small_city())
+    with pytest.raises(MapError, match=r"which covers .* in metres: the net has no projection\)"):
+        import_map(flat, options=Options(bbox=(5000.0, 5000.0, 6000.0, 6000.0)))
     assert kept() == before
+
+
+@pytest.mark.engine
+def test_large_files_are_told_of_the_box(tmp_path: Path, cosim: Cosim, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An import that takes minutes says so when it begins, with the option that makes it faster."""
+    monkeypatch.setattr(importer, "BIG", 5)
+    source = written(tmp_path / "town.osm", osm(blocks=2))
+    done = cosim("map", "import", str(source))
+    assert "converting 8 streets and paths (--bbox west,south,east,north: a part is faster) ...\n" in done.stderr
 
 
 @pytest.mark.engine
@@ -349,11 +402,11 @@ def test_names_come_from_files() -> None:
 @pytest.mark.engine
 def test_a_slow_netconvert_is_told_with_the_remedy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A conversion that does not end is stopped; one line names the user's file and what to do."""
-    monkeypatch.setattr(importer, "TIMEOUT_S", 0.001)
+    monkeypatch.setattr(netsteps, "TIMEOUT_S", 0.001)
     source = written(tmp_path / "town.osm", osm())
     with pytest.raises(MapError) as caught:
         import_map(source)
-    assert str(caught.value) == f"{source}: netconvert did not end within 0.001 s: cut the area of interest out first"
+    assert str(caught.value) == f"{source}: netconvert did not end within 0.001 s: import a part of it with --bbox"
 
 
 @pytest.mark.engine

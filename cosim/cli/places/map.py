@@ -41,7 +41,7 @@ def import_(
     file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
     name: Annotated[str | None, typer.Option(help="Its name from now on; by default the file's.")] = None,
     bbox: Annotated[
-        str | None, typer.Option(help="Keep this part: west,south,east,north in degrees (metres without projection).")
+        str | None, typer.Option(help="Only this part: west,south,east,north in degrees (metres without projection).")
     ] = None,
     lefthand: Annotated[
         bool | None, typer.Option("--lefthand/--righthand", help="Side people drive on; by default looked up.")
@@ -60,8 +60,8 @@ def import_(
 
     box = None if bbox is None else box_of("--bbox", bbox)
     options = Options(bbox=box, lefthand=lefthand, as_is=as_is, sidewalk_width_m=sidewalk_width)
-    with doing(f"converting {file.name}") as tell:
-        about = import_map(file, name, options)
+    with doing(f"reading {file.name}") as tell:
+        about = import_map(file, name, options, tell)
         tell(f"checking {about.name}")
         _, check, about = checked_map(about.name)
     print_check(check, about)

@@ -14,6 +14,8 @@ from cosim.core.telling import Tell, duration
 
 _SURE, _SURE_S = 0.03, 3.0
 """Of less of a stage than this share, or after less time, nothing is concluded."""
+AGAIN_S = 30.0
+"""Without a terminal a stage whose share is known gets a further line after this time, and so on."""
 
 
 @contextmanager
@@ -37,13 +39,18 @@ def doing(first: str, console: Console = err) -> Iterator[Tell]:
 
             yield move
         return
-    said = ""
+    said, began, last = "", 0.0, 0.0
 
     def tell(stage: str, share: float | None = None) -> None:
-        nonlocal said
+        nonlocal said, began, last
+        now_s = time.monotonic()
         if stage != said:
-            said = stage
+            said, began, last = stage, now_s, now_s
             console.print(f"{stage} ...", soft_wrap=True, markup=False, highlight=False)
+        elif share is not None and now_s - last >= AGAIN_S:
+            last = now_s
+            words = f"{stage_in_words(stage, share, now_s - began)}, after {duration(now_s - began)}"
+            console.print(words, soft_wrap=True, markup=False, highlight=False)
 
     tell(first)
     yield tell

@@ -7,6 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
+from cosim.cli.terminal import progress
 from cosim.cli.terminal.progress import doing, stage_in_words
 from cosim.core.telling import duration
 
@@ -19,6 +20,16 @@ def test_a_log_gets_one_line_for_each_stage() -> None:
             tell("simulating to 20 s", share)
         tell("drawing")
     assert said.getvalue() == "reading [the] city ...\nsimulating to 20 s ...\ndrawing ...\n"
+
+
+def test_a_log_gets_further_lines_of_a_long_stage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A stage that takes long says from time to time how much of it is done, if it knows."""
+    monkeypatch.setattr(progress, "AGAIN_S", 0.0)
+    said = io.StringIO()
+    with doing("converting", Console(file=said, width=80)) as tell:
+        tell("converting")
+        tell("converting", 0.5)
+    assert said.getvalue() == "converting ...\nconverting: 50 %, after 0 s\n"
 
 
 def test_a_terminal_gets_a_line_that_moves_and_is_gone() -> None:
