@@ -40,7 +40,6 @@ MAP: StreetMap = dataclasses.replace(
         name: dataclasses.replace(s, street_class=CLASSES.get(name, ""), verge_m=1.5 if name in ("sw", "se") else 0.0)
         for name, s in BASE.strips.items()
     },
-    _trees={},
 )
 EMPTY = Street(0)
 SHARED = Path(os.environ.get("COSIM_SHARED", Path(__file__).parents[3] / "shared")) / "maps"

@@ -271,7 +271,7 @@ def test_a_picture_depends_on_its_moment_alone() -> None:
 def test_everything_has_its_label() -> None:
     """One view over the street holds every label, and the lamp shows red or green as the signal says."""
     strips = {k: dataclasses.replace(s, signalised=s.kind == "crossing") for k, s in MAP.strips.items()}
-    street_map = dataclasses.replace(MAP, strips=strips, _trees={})
+    street_map = dataclasses.replace(MAP, strips=strips)
     fence = Barrier(x_m=4.0, y_m=5.0, heading_rad=0.0, length_m=3.0, strip="ne", end=0)
     vehicles = Vehicles.of(("v1",), [[-6.0, 1.75]], [math.pi], [5.0], [[4.5, 1.8]])
     people = person(-8.0, 5.0).people

@@ -113,7 +113,7 @@ def test_buildings_do_not_depend_on_the_order_but_on_the_seed() -> None:
 def test_paint_lies_on_its_ground() -> None:
     """Lines are on roads and domes on walkable ground, millimetres above it."""
     crossing = dataclasses.replace(MAP.strips[":c0"], signalised=True, crosses=("e", "-e"))
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": crossing}, _trees={})
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": crossing})
     found: dict[str, int] = {}
     for key in keys_within(0.0, 0.0, 60.0):
         tile = build_tile(street_map, key)
@@ -135,7 +135,7 @@ def test_domes_lie_in_the_triangles_of_the_ground() -> None:
     askew = dataclasses.replace(
         MAP.strips[":c0"], line=line, polygon=shapely.LineString(line).buffer(1.6, cap_style="flat"), width_m=3.2
     )
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": askew}, _trees={})
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, ":c0": askew})
     spread, checked = [], 0
     for key in keys_within(0.0, 0.0, 60.0):
         tile = build_tile(street_map, key)
@@ -169,7 +169,7 @@ def test_the_frontage_is_paved_where_there_are_shops(tiles: dict[Key, Tile]) -> 
         "nw": dataclasses.replace(MAP.strips["nw"], street_class="commercial"),
         "ne": dataclasses.replace(MAP.strips["ne"], street_class="residential", driveways=(30.0,)),
     }
-    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, planned=True, _trees={})
+    street_map = dataclasses.replace(MAP, strips={**MAP.strips, **changed}, planned=True)
     covered, layers, rims = [], set(), []
     for key in KEYS:
         tile = build_tile(street_map, key)
