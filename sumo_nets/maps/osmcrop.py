@@ -28,10 +28,12 @@ def crop_osm(file: Path, target: Path, box: Box, source: Path) -> None:
     box: west, south, east, north in degrees.
     source: the file to name in errors.
     """
+    import osmium
+
     try:
         part = _chosen(file, box, source)
         _write(file, target, part)
-    except (OSError, RuntimeError, ValueError) as error:
+    except (OSError, RuntimeError, ValueError, osmium.InvalidLocationError) as error:
         raise MapError(f"{source}: cannot be cropped: {error}: get it again") from error
 
 
@@ -60,6 +62,8 @@ class _Part:
 
 def _chosen(file: Path, box: Box, source: Path) -> _Part:
     inside, bounds = _inside(file, box)
+    if not math.isfinite(bounds[0]):
+        raise MapError(f"{source}: an OpenStreetMap file without nodes: export a larger area")
     refuse_box_outside(source, box, bounds)
     part, streets = _Part(set(inside)), 0
     for way in _of(file, "WAY"):

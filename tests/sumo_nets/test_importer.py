@@ -302,6 +302,9 @@ def test_a_bad_box_is_refused_with_the_bounds(tmp_path: Path, cosim: Cosim, monk
         import_map(source, "swapped", Options(bbox=(52.5, 13.4, 52.501, 13.401)))
     with pytest.raises(MapError, match=r"no street or path .* lies in --bbox .*; the file covers 13\.4,52\.5,"):
         import_map(source, "empty", Options(bbox=(13.4005, 52.5003, 13.4006, 52.5004)))
+    broken = written(tmp_path / "broken.osm", osm().replace('lon="13', 'lon="x13', 1))
+    with pytest.raises(MapError, match=r"broken\.osm: cannot be cropped: wrong format for coordinate"):
+        import_map(broken, options=Options(bbox=(13.4, 52.5, 13.41, 52.51)))
     net = netconvert(["--osm-files", str(source)], tmp_path / "projected.net.xml")
     with pytest.raises(MapError, match=r"outside of the map, which covers 13\.4,52\.5,.* in degrees\)"):
         import_map(net, options=Options(bbox=(1.0, 1.0, 2.0, 2.0)))
