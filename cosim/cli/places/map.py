@@ -35,7 +35,7 @@ map_app = typer.Typer(no_args_is_help=True, rich_markup_mode="markdown", help="C
     "import",
     epilog="Examples:  \n"
     "`cosim map import berlin.osm.pbf --bbox 13.43,52.46,13.45,52.48`  \n"
-    "`cosim map import hamburg.net.xml.gz`",
+    "`cosim map import hamburg.net.xml.gz --sidewalk-width 3`",
 )
 def import_(
     file: Annotated[Path, typer.Argument(help=".net.xml, .net.xml.gz, .osm, .osm.gz, .osm.bz2 or .osm.pbf")],
