@@ -29,6 +29,8 @@ from cosim.spec.policy_host import PolicyRuns
 PolicyCall = Literal["loading", "reset", "first act", "act", "on_reset", "ended"]
 """What a policy is busy with. The first answer of an episode may take longer than the others."""
 
+LOADED_WITHIN_S = 300.0
+"""A policy may take so long to be loaded, for a reset and for the first answer, unless a run says otherwise."""
 MOST_SAID = 500
 """Of what a policy says when it raises, so many characters are kept."""
 

@@ -16,7 +16,7 @@ import msgspec
 
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError, UsageError, unknown
-from cosim.episode.driver import Driver, Timer, told_of
+from cosim.episode.driver import LOADED_WITHIN_S, Driver, Timer, told_of
 from cosim.episode.given import with_goal
 from cosim.episode.ports import CameraSpec, Manifest, Policy
 from cosim.policies import POLICIES
@@ -36,17 +36,19 @@ OTHER_NAMES = ("path/to/file.py:Class", "package.module:Class", f"{ONNX_SCHEME}F
 """How policies are named that are not listed."""
 
 
-def load_policy(name: str, timer: Timer | None = None) -> Driver:
+def load_policy(name: str, timer: Timer | None = None, start_s: float = LOADED_WITHIN_S) -> Driver:
     """A new policy, its manifest read. Raises UsageError when the name means nothing or the class is no policy.
 
-    timer: is told while the policy is loaded and whenever it is asked.
+    timer: is told while the policy is loaded and whenever it is asked; whoever reads it ends what takes too long.
+    start_s: without a timer an ONNX graph may take so long to be loaded and to answer once.
 
     >>> load_policy("route").manifest.name
     'route'
     """
     name = importable(name)
+    within_s = start_s if timer is None else None
     if name.startswith(ONNX_SCHEME):
-        return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser()), timer)
+        return _by_networks(name, _bundle(Path(name.removeprefix(ONNX_SCHEME)).expanduser(), within_s), timer)
     if name.startswith(REMOTE_SCHEME):
         raise UsageError(f"policy '{name}' is served elsewhere; here it must be one that this process can load")
     if ":" not in name:
@@ -55,7 +57,7 @@ def load_policy(name: str, timer: Timer | None = None) -> Driver:
             return Driver(policy, source_hash=source_hash(policy), timer=timer)
         bundles = shipped_bundles()
         if name in bundles:
-            return _by_networks(name, _bundle(bundles[name]), timer)
+            return _by_networks(name, _bundle(bundles[name], within_s), timer)
         if name == FOLLOW:
             return _by_networks(name, _follow, timer)
         raise unknown("policy", name, [*POLICIES, *bundles, FOLLOW, *OTHER_NAMES])
@@ -80,13 +82,13 @@ class _Networked(Policy, Protocol):
     digest: str
 
 
-def _bundle(folder: Path) -> Callable[[], _Networked]:
-    """What makes the policy of an ONNX bundle."""
+def _bundle(folder: Path, within_s: float | None) -> Callable[[], _Networked]:
+    """What makes the policy of an ONNX bundle; within_s: see `OnnxPolicy`."""
 
     def make() -> _Networked:
         from cosim.policies.onnx.policy import onnx_policy  # onnxruntime takes a moment to import
 
-        return onnx_policy(folder)
+        return onnx_policy(folder, within_s)
 
     return make
 

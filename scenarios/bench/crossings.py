@@ -16,6 +16,7 @@ from functools import cache
 import msgspec
 import numpy as np
 
+from cosim.core.child import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import SpecError
 from cosim.episode.driver import Driver
@@ -29,7 +30,6 @@ from scenarios.bench.crowd_tally import Tally
 from scenarios.builders.crossings import build_all
 from scenarios.execution.places import place
 from scenarios.execution.run import Outcome, run_episode
-from scenarios.execution.shepherd import end_with
 from sumo_nets.crowd.stoplines import StopLines
 
 _SIZE_M = 2000.0

@@ -17,6 +17,7 @@ from multiprocessing.connection import Connection
 import msgspec
 import numpy as np
 
+from cosim.core.child import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
 from cosim.core.geometry import Floats, Polyline, Pose
@@ -26,7 +27,6 @@ from cosim.place.walk_graph import WalkGraph
 from cosim.spec.events import Actor, EventReply
 from cosim.spec.scenario import Place, Scenario
 from scenarios.execution.places import place
-from scenarios.execution.shepherd import end_with
 from scenarios.execution.wiring import crowd_of
 
 BODIES = 3

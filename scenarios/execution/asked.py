@@ -12,7 +12,7 @@ import struct
 import time
 from typing import Final, NamedTuple, get_args
 
-from cosim.episode.driver import PolicyCall, when
+from cosim.episode.driver import LOADED_WITHIN_S, PolicyCall, when
 
 _DOINGS: Final[tuple[PolicyCall, ...]] = get_args(PolicyCall)
 _LAYOUT: Final = struct.Struct("dqq")  # since when, 0.0 while nothing is asked; what it is doing; at which tick
@@ -22,7 +22,7 @@ class Patience(NamedTuple):
     """Seconds a policy may take: for an answer; for being loaded, for a reset, for the first answer after it."""
 
     answer_s: float = 60.0
-    start_s: float = 300.0
+    start_s: float = LOADED_WITHIN_S
 
     def of(self, doing: PolicyCall) -> float:
         return self.start_s if doing in ("loading", "reset", "first act") else self.answer_s

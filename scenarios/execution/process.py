@@ -16,10 +16,11 @@ from typing import Final
 
 import msgspec
 
+from cosim.core.child import ended_in_words
 from cosim.core.errors import unwritable
+from cosim.core.wire import MOST_WIRED_BYTES, Wire
 from scenarios.execution.asked import Asked, Question
 from scenarios.execution.messages import Hear, Hello, Job, decode_message, encode_message
-from scenarios.execution.wire import MOST_WIRED_BYTES, Wire
 
 WORKER: Final = "scenarios.execution.worker:serve_jobs"
 ENDING_S: Final = 10.0
@@ -145,8 +146,4 @@ class KeptProcess:
 
 
 def _in_words(code: int | None) -> str:
-    if code is None:
-        return "closed its pipe to the run"
-    if code < 0:
-        return f"was killed by {signal.Signals(-code).name}"
-    return f"ended with exit code {code}"
+    return "closed its pipe to the run" if code is None else ended_in_words(code)

@@ -6,7 +6,7 @@ The shepherd forks the worker, writes what it prints to its log, and ends as the
 its signal. First it kills what the worker has left behind: children whose parent is dead become the shepherd's, also
 those that made a session of their own. It does the same when the run tells it to end (SIGTERM) or dies.
 
-It imports nothing but the standard library: it is small, and forks before there is a thread.
+It imports little but the standard library: it is small, and forks before there is a thread.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 
-PR_SET_PDEATHSIG = 1
+from cosim.core.child import end_with
+
 PR_SET_CHILD_SUBREAPER = 36
 FIRST_BYTES = LAST_BYTES = 2 << 20
 """Of what a worker prints the beginning and the end are kept; what a policy pours out in between is left out."""
@@ -39,7 +40,7 @@ def keep_worker(serves: str, descriptors: tuple[int, ...], parent: int) -> None:
     serves: the function that is the worker, as module:name; descriptors: what it is called with, of its socket to the
     run first. parent: process id of the run. What the worker prints goes to this process's standard output."""
     end_with(parent, signal.SIGTERM)
-    _prctl(PR_SET_CHILD_SUBREAPER, 1)
+    ctypes.CDLL(None, use_errno=True).prctl(PR_SET_CHILD_SUBREAPER, 1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     printed, prints = os.pipe()
     shepherd = os.getpid()
@@ -90,13 +91,6 @@ class BoundedLog:
         with suppress(OSError):  # a full disk: the worker's own report tells it
             while text:
                 text = text[os.write(self._descriptor, text) :]
-
-
-def end_with(parent: int, how: signal.Signals = signal.SIGKILL) -> None:
-    """Ask Linux to signal this process when its parent dies, however that happens; end if it is dead already."""
-    _prctl(PR_SET_PDEATHSIG, how)
-    if os.getppid() != parent:
-        os._exit(1)
 
 
 def kill_children() -> None:
@@ -169,7 +163,3 @@ def _end_as(status: int) -> None:
             signal.signal(os.WTERMSIG(status), signal.SIG_DFL)
         os.kill(os.getpid(), os.WTERMSIG(status))
     os._exit(os.waitstatus_to_exitcode(status))
-
-
-def _prctl(option: int, value: int) -> None:
-    ctypes.CDLL(None, use_errno=True).prctl(option, value)

@@ -165,7 +165,7 @@ def planned_run(
     part = Shard.called(shard, len(of_run)) if shard else None
     if part is not None and options.seed is None and resumed is None:
         raise UsageError("--shard needs --seed: shards are of one run, which has one seed: give the same to each")
-    driver = known_driver(policy, host, jobs) if isinstance(policy, str) else Driver.of(policy)
+    driver = known_driver(policy, host, jobs, patience.start_s) if isinstance(policy, str) else Driver.of(policy)
     name = policy if isinstance(policy, str) else f"{type(policy).__module__}:{type(policy).__qualname__}"
     camera = chosen_camera(options.camera) if driver.manifest.camera is not None else "bullet"
     seed = seed_of_run(options.seed, resumed)

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 from cosim.core.clock import Clock
 from cosim.core.errors import MachineError, RendererLost, UsageError
+from cosim.core.wire import Wire
 from cosim.episode.driver import Driver, said_by
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
@@ -42,7 +43,6 @@ from scenarios.execution.messages import (
     decode_job,
     encode_message,
 )
-from scenarios.execution.wire import Wire
 from scenarios.rendering.link import AskedElsewhere, link_to
 from scenarios.serving.drivers import policy_driver
 

@@ -18,11 +18,11 @@ import shapely
 
 from cosim.core.errors import EngineError, PolicyError, RendererLost
 from cosim.core.state import Command, Frame, Planned, RobotState, Street
+from cosim.core.wire import Wire
 from cosim.episode.driver import Driver, when
 from cosim.episode.ports import Manifest, Observation, Privileged
 from cosim.spec.options import RendererAt
 from cosim.spec.scenario import Scenario
-from scenarios.execution.wire import Wire
 from scenarios.rendering.exchange import (
     Ask,
     Begin,

@@ -28,6 +28,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from cosim.core.clock import Clock
 from cosim.core.errors import PolicyError
 from cosim.core.state import Planned
+from cosim.core.wire import Wire
 from cosim.episode.driver import BatchDriver, said_by
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import Observation, Privileged
@@ -38,7 +39,6 @@ from physics.world.street_surface import StreetSurface
 from scenarios.execution.asked import Asked
 from scenarios.execution.messages import Ready
 from scenarios.execution.places import place
-from scenarios.execution.wire import Wire
 from scenarios.execution.wiring import world_of
 from scenarios.execution.worker import policy_here, said_to_run
 from scenarios.rendering.exchange import (

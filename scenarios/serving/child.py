@@ -15,8 +15,9 @@ import msgspec
 
 from bridge.policy_server import PolicyDesk, PolicyInfo, Refusal, encode_asked
 from cosim.core.errors import UsageError
+from cosim.core.wire import Wire
+from cosim.episode.driver import Untimed
 from cosim.policies.load import load_policy
-from scenarios.execution.wire import Wire
 from scenarios.serving.observed import seen_from_afar
 
 
@@ -31,7 +32,7 @@ def serve_alone(socket_descriptor: int, asked_descriptor: int, memory_descriptor
     os.close(memory_descriptor)
     name = wire.receive().decode()
     try:
-        driver = load_policy(name)
+        driver = load_policy(name, Untimed())  # who started this process ends what takes too long
     except UsageError as error:
         wire.send(encode_asked(Refusal("policy", str(error))))
         return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cosim.core.errors import UsageError
-from cosim.episode.driver import Driver, Timer
+from cosim.episode.driver import LOADED_WITHIN_S, Driver, Timer
 from cosim.episode.ports import Manifest
 from cosim.policies.load import REMOTE_SCHEME, load_policy
 from cosim.policies.own_module import importable
@@ -11,9 +11,16 @@ from cosim.spec.policy_host import PolicyHost
 from scenarios.serving.isolated import isolated_driver
 
 
-def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expected: Manifest | None = None) -> Driver:
+def policy_driver(
+    name: str,
+    host: PolicyHost,
+    timer: Timer | None = None,
+    expected: Manifest | None = None,
+    start_s: float = LOADED_WITHIN_S,
+) -> Driver:
     """A policy by its name. expected: its manifest as the run knows it; one elsewhere is only asked who it is without.
-    Raises UsageError.
+    start_s: without a timer it may take so long to be loaded, where it is loaded in a process of its own. Raises
+    UsageError.
 
     >>> policy_driver("route", PolicyHost()).manifest.name
     'route'
@@ -28,14 +35,14 @@ def policy_driver(name: str, host: PolicyHost, timer: Timer | None = None, expec
     if host.servers:
         raise UsageError(f"--policy-at goes with --policy {REMOTE_SCHEME}NAME, not with '{name}'")
     if host.isolated:
-        return isolated_driver(name, timer, expected, host.run)
-    return load_policy(name, timer)
+        return isolated_driver(name, timer, expected, host.run, start_s)
+    return load_policy(name, timer, start_s)
 
 
-def known_driver(name: str, host: PolicyHost, jobs: int = 1) -> Driver:
+def known_driver(name: str, host: PolicyHost, jobs: int = 1, start_s: float = LOADED_WITHIN_S) -> Driver:
     """A policy for who wants to know what it is, before a run asks it: one elsewhere is left at once. Raises UsageError
     when its servers answer for fewer episodes at a time than there are jobs."""
-    driver = policy_driver(name, host)
+    driver = policy_driver(name, host, start_s=start_s)
     driver.close()
     if 0 < driver.at_once < jobs:
         raise UsageError(

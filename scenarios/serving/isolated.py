@@ -18,7 +18,7 @@ from bridge.policy_server import (
     encode_asked,
 )
 from cosim.core.errors import PolicyError, UsageError
-from cosim.episode.driver import Timer, Untimed
+from cosim.episode.driver import LOADED_WITHIN_S, Timer, Untimed
 from cosim.episode.given import with_goal
 from cosim.episode.ports import Manifest
 from cosim.policies.load import checked_manifest
@@ -53,10 +53,12 @@ class _PolicyProcess:
             raise PolicyError("gave an answer that nobody had asked for")
         return reply
 
-    def received(self) -> PolicyInfo | Begun | Answer | Refusal:
+    def received(self, within_s: float | None = None) -> PolicyInfo | Begun | Answer | Refusal:
         try:
-            reply: PolicyInfo | Begun | Answer | Refusal = decode_answered(self._process.wire.receive())
+            reply: PolicyInfo | Begun | Answer | Refusal = decode_answered(self._process.wire.receive(within_s))
             return reply
+        except TimeoutError:
+            raise PolicyError(f"gave no answer for {within_s:g} s: --start-timeout gives it longer") from None
         except UNREADABLE as error:
             raise PolicyError(f"sent what is no answer: {error}") from None
         except (EOFError, OSError):
@@ -74,16 +76,20 @@ class _PolicyProcess:
 
 
 def isolated_driver(
-    name: str, timer: Timer | None = None, expected: Manifest | None = None, run: str = ""
+    name: str,
+    timer: Timer | None = None,
+    expected: Manifest | None = None,
+    run: str = "",
+    start_s: float = LOADED_WITHIN_S,
 ) -> HostedDriver:
     """A policy by its name, in a process of its own. expected: its manifest as the run knows it, with which it is
-    to be asked; without, nothing is. Raises UsageError as `load_policy` does, and for one that is told what only the
-    simulator knows."""
+    to be asked; without, nothing is. start_s: without a timer it may take so long to be loaded. Raises UsageError as
+    `load_policy` does, and for one that is told what only the simulator knows."""
     watched: Timer = Untimed() if timer is None else timer
     watched.starts("loading", 0)
     process = _PolicyProcess(name, room_for(expected))
     try:
-        info = process.received()
+        info = process.received(start_s if timer is None else None)
         if isinstance(info, Refusal):
             raise UsageError(info.words)
         if not isinstance(info, PolicyInfo):

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 import shapely
 
+from cosim.core.child import end_with
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError, unwritable
 from cosim.core.telling import Tell, untold
@@ -28,7 +29,6 @@ from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.spec.options import CameraChoice
 from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.execution.places import place
-from scenarios.execution.shepherd import end_with
 from scenarios.viewing.scenes import ShownAgain, image_url, show_again
 
 _MOST_BYTES: Final = 29_000_000

@@ -54,7 +54,7 @@ class Held(Base):
 class DiesLate(Base):
     # takes its process down right after the record of t-1 is sent, and once in the middle of that of t-2
     def act(self, observation):
-        from scenarios.execution.wire import Wire
+        from cosim.core.wire import Wire
         send = Wire.send
         def dying(wire, message):
             done = b"Done" in message[:20] and len(message) > 2000

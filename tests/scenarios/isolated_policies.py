@@ -40,6 +40,13 @@ class Honest:
         return Command(1.0 + float(seen.rgb.mean()) / 1e4, 0.0)
 
 
+class Hanging(Honest):
+    """Is never made."""
+
+    def __init__(self) -> None:
+        time.sleep(3600)
+
+
 class Cheat(Honest):
     """Does, when it is asked for the second time, what its episode is called."""
 

@@ -150,3 +150,11 @@ def test_isolated_what_cannot_be_loaded_is_said(tmp_path: Path, monkeypatch: pyt
     assert said.returncode == 2 and "is told what the simulator knows (privileged)" in said.stderr
     with pytest.raises(UsageError, match="needs a policy by its name"):
         suite_run.run("unit", Honest(), host=PolicyHost(isolated=True))
+
+
+def test_an_isolated_policy_that_is_never_made_is_refused() -> None:
+    """A run that only wants to know who it is gives it the start timeout, and leaves nothing."""
+    with pytest.raises(
+        UsageError, match=r"cannot be loaded: it gave no answer for 1 s: --start-timeout gives it longer"
+    ):
+        isolated_driver(f"{OF}:Hanging", start_s=1.0)

@@ -14,6 +14,7 @@ import msgspec
 import pytest
 
 from cosim.core.errors import MachineError
+from cosim.core.wire import Wire
 from cosim.episode.driver import PolicyCall
 from cosim.policies.load import load_policy
 from cosim.records.record import Record, begun
@@ -26,7 +27,6 @@ from scenarios.execution import pool
 from scenarios.execution.asked import Asked, Patience, Question
 from scenarios.execution.messages import Done, FrameDrawn, Hear, Hello, Job, LostRenderer, Message, Progress, Ready
 from scenarios.execution.shepherd import BoundedLog
-from scenarios.execution.wire import Wire
 from scenarios.rendering.shared import End, SharedRenderer
 from tests.conftest import PATIENCE_S, Cosim, seed_in_order
 

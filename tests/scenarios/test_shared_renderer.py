@@ -20,6 +20,7 @@ import shapely
 from cosim.core.errors import EngineError, PolicyError, RendererLost, UsageError
 from cosim.core.geometry import Pose
 from cosim.core.state import NO_VEHICLES, Frame, People, RobotState, Signal, Street
+from cosim.core.wire import Wire
 from cosim.episode.driver import Driver
 from cosim.episode.log import Log
 from cosim.episode.ports import CameraSpec, Manifest, Policy
@@ -34,7 +35,6 @@ from scenarios.execution import suite_run
 from scenarios.execution.asked import Patience
 from scenarios.execution.messages import Hello, Progress
 from scenarios.execution.places import place
-from scenarios.execution.wire import Wire
 from scenarios.rendering.exchange import (
     Ask,
     Begin,

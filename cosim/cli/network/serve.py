@@ -42,6 +42,7 @@ def serve_command(
     from bridge import keys
     from bridge.policy_server import serve
     from bridge.session import open_session
+    from cosim.episode.driver import Untimed
     from cosim.episode.ports import Policy
     from cosim.policies.load import load_policy
     from scenarios.serving.observed import seen_from_afar
@@ -54,7 +55,7 @@ def serve_command(
     spare = [first.policy]
 
     def another() -> Policy:
-        return spare.pop() if spare else load_policy(policy).policy
+        return spare.pop() if spare else load_policy(policy, Untimed()).policy
 
     if connect:
         connection = connecting("policy", "--connect", connect, tls, insecure)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,14 +57,22 @@ class TensorPort:
         return f"{self.dtype.name} ({axes}{',' * (len(self.shape) == 1)})"
 
 
+class AskedGraph(Protocol):
+    """A graph that can be asked: in this process (`Graph`), or on trial in another (`cosim.policies.onnx.trial`)."""
+
+    path: Path
+    inputs: Mapping[str, TensorPort]
+    outputs: Mapping[str, TensorPort]
+
+    def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
+        """The outputs of these names. Whatever the runtime raises is raised."""
+
+
 class Graph:
     """A graph, loaded. Raises UsageError for one that the runtime refuses; MachineError where there is no runtime."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise MachineError(f"onnxruntime cannot be imported: {error}: pip install onnxruntime") from error
+        onnxruntime = import_runtime()
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.use_deterministic_compute = True
@@ -80,8 +88,8 @@ class Graph:
         except Exception as error:
             raise UsageError(f"{path}: {_refusal(error, onnxruntime.__version__)}") from error
         self.path = path
-        self.inputs = {one[0]: self._port(*one) for one in inputs}
-        self.outputs = {one[0]: self._port(*one) for one in outputs}
+        self.inputs: Mapping[str, TensorPort] = {one[0]: self._port(*one) for one in inputs}
+        self.outputs: Mapping[str, TensorPort] = {one[0]: self._port(*one) for one in outputs}
 
     @property
     def on_cpu(self) -> bool:
@@ -97,6 +105,20 @@ class Graph:
     def ask(self, tensors: Mapping[str, Tensor], names: Sequence[str]) -> dict[str, Tensor]:
         """The outputs of these names. What the runtime raises is raised."""
         return dict(zip(names, self._session.run(list(names), dict(tensors)), strict=True))
+
+
+def import_runtime() -> Any:
+    """The module onnxruntime. Raises MachineError where there is none."""
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise MachineError(f"onnxruntime cannot be imported: {error}: pip install onnxruntime") from error
+    return onnxruntime
+
+
+def runs_on_cpu() -> bool:
+    """Whether graphs are asked on the CPU alone."""
+    return _providers(import_runtime().get_available_providers()) == (_CPU,)
 
 
 def _told(port: Any) -> tuple[str, str, Sequence[Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import msgspec
@@ -13,14 +14,16 @@ from cosim.core.errors import PolicyError, UsageError
 from cosim.core.npz import read_npz
 from cosim.core.state import STILL, Command
 from cosim.episode.control import command_of
+from cosim.episode.driver import LOADED_WITHIN_S
 from cosim.episode.given import calibration_of
 from cosim.episode.ports import Manifest, Observation
 from cosim.policies.onnx.answers import PolicyAnswer, answer_of, check_outputs
 from cosim.policies.onnx.feeding import Feeder
-from cosim.policies.onnx.graph import NUMBERS, Graph, Tensor, said_by_runtime
+from cosim.policies.onnx.graph import NUMBERS, AskedGraph, Graph, Tensor, runs_on_cpu, said_by_runtime
 from cosim.policies.onnx.inputs import StateInput
 from cosim.policies.onnx.manifest import MOST_EXAMPLE_BYTES, BundleManifest
 from cosim.policies.onnx.reading import read_bundle
+from cosim.policies.onnx.trial import TrialGraph
 from cosim.policies.onnx.weights import bundle_files
 from cosim.spec.goal import Goal, GoalProtocol, ImageGoal, Instruction, PointGoal, RoutePatch
 from cosim.spec.odometry import Odometry
@@ -31,11 +34,11 @@ _GREY = 128
 _PATCH_PX = 80
 
 
-def onnx_policy(place: Path) -> OnnxPolicy:
+def onnx_policy(place: Path, within_s: float | None = LOADED_WITHIN_S) -> OnnxPolicy:
     """The policy of a bundle. Off the CPU, and where the graph's first axis may be of any length, it answers for many
     episodes at once. Raises as `OnnxPolicy` does."""
-    policy = OnnxPolicy(place)
-    return policy if policy.graph.on_cpu or not policy.takes_batches else OnnxBatchPolicy(place)
+    policy = OnnxPolicy(place, within_s)
+    return policy if policy.graph.on_cpu or not policy.takes_batches else OnnxBatchPolicy(place, within_s)
 
 
 class _Memory:
@@ -52,23 +55,27 @@ class _Memory:
 
 class OnnxPolicy:
     """A bundle's policy. Raises UsageError or SpecError, before anything is driven, for whatever of the bundle is
-    missing or does not fit together; it is asked once, in a grey street, to see that.
+    missing or does not fit together; it is asked once, in a grey street, to see that. within_s: it is loaded and asked
+    in a child process first, which may take so long (`TrialGraph`); None where another process limits this one.
 
     bundle: its manifest; digest: a hash of that, of the weights, and of what the graph answers in that street: its last
     bits hang on the processor, of which runs that are continued or merged must be one kind; example: where its example
     would be.
     """
 
-    def __init__(self, place: Path) -> None:
+    def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
         found = read_bundle(place)
         self.bundle, self.example, self.manifest = found.manifest, found.example, found.manifest.policy
-        files = bundle_files(found.folder, self.bundle)
-        self.digest = hashlib.blake2b(msgspec.json.encode(self.bundle) + files.digest.encode()).hexdigest()
-        self.graph = Graph(files.graph)
-        self._check()
+        self._files = files = bundle_files(found.folder, self.bundle)
+        self._within_s = within_s if runs_on_cpu() else None
         self._names = [*dict.fromkeys([*self.bundle.output.outputs, *_state_outputs(self.bundle)])]
-        self._memory = self._begun(0)
-        self.digest = hashlib.blake2b(self.digest.encode() + self._try(files.graph)).hexdigest()
+        with self.on_trial() as graph:
+            self._check(graph)
+            self._memory = _Memory(Feeder(self.bundle.inputs, graph.inputs, 0))
+            answered = self._try(graph)
+        self.graph = graph if isinstance(graph, Graph) else Graph(files.graph)
+        digest = hashlib.blake2b(msgspec.json.encode(self.bundle) + files.digest.encode()).hexdigest()
+        self.digest = hashlib.blake2b(digest.encode() + answered).hexdigest()
 
     @property
     def takes_batches(self) -> bool:
@@ -87,19 +94,27 @@ class OnnxPolicy:
 
     def act(self, observation: Observation) -> PolicyAnswer:
         """Waypoints (N, 2) or (N, 4) in units of the manifest's rule, or a command."""
-        return self._answers([self._memory], [observation])[0]
+        return self._answers(self.graph, [self._memory], [observation])[0]
+
+    def on_trial(self) -> AbstractContextManager[Graph | TrialGraph]:
+        """The graph where it cannot do harm; in this process where that is limited by others."""
+        if self._within_s is None:
+            return nullcontext(Graph(self._files.graph))
+        return TrialGraph(self._files.graph, self._files.size, self._within_s)
 
     def _begun(self, seed: int) -> _Memory:
         return _Memory(Feeder(self.bundle.inputs, self.graph.inputs, seed))
 
-    def _answers(self, memories: Sequence[_Memory], seen: Sequence[Observation]) -> list[PolicyAnswer]:
+    def _answers(
+        self, graph: AskedGraph, memories: Sequence[_Memory], seen: Sequence[Observation]
+    ) -> list[PolicyAnswer]:
         """To one question; to several where the graph takes them."""
         asked = [memory.feeder.feed(one) for memory, one in zip(memories, seen, strict=True)]
         if len(asked) == 1:
-            told = [self.graph.ask(asked[0], self._names)]
+            told = [graph.ask(asked[0], self._names)]
         else:
             whole = {name: np.concatenate([one[name] for one in asked]) for name in asked[0]}
-            all_told = self.graph.ask(whole, self._names)
+            all_told = graph.ask(whole, self._names)
             told = [{name: array[i : i + 1] for name, array in all_told.items()} for i in range(len(asked))]
         return [self._answer(*each) for each in zip(memories, seen, told, strict=True)]
 
@@ -110,42 +125,43 @@ class OnnxPolicy:
             memory.last = answer
         return answer
 
-    def _check(self) -> None:
+    def _check(self, graph: AskedGraph) -> None:
         """Raises UsageError unless graph and manifest have the same inputs, and the graph the outputs."""
-        wanted, given = self.graph.inputs, self.bundle.inputs
+        wanted, given = graph.inputs, self.bundle.inputs
         if lacking := sorted(wanted.keys() - given.keys()):
             told = "; ".join(f"'{name}' {wanted[name].in_words}" for name in lacking)
             raise UsageError(f"inputs: the graph wants {told}, of which the manifest says nothing")
         if over := sorted(given.keys() - wanted.keys()):
             raise UsageError(f"inputs: the graph has no input '{over[0]}'. Valid choices: {', '.join(wanted)}")
-        check_outputs(self.bundle.output, self.graph.outputs)
+        check_outputs(self.bundle.output, graph.outputs)
         for name, one in given.items():
-            if isinstance(one, StateInput) and one.output not in self.graph.outputs:
-                choices = ", ".join(self.graph.outputs)
+            if isinstance(one, StateInput) and one.output not in graph.outputs:
+                choices = ", ".join(graph.outputs)
                 raise UsageError(f"inputs.{name}: the graph has no output '{one.output}'. Valid choices: {choices}")
 
-    def _try(self, path: Path) -> bytes:
+    def _try(self, graph: AskedGraph) -> bytes:
         """Asks once, as a run would, and gives the bytes of what the graph answered. Raises UsageError for what the
         runtime cannot do, and for an answer that is none."""
         seen = in_grey(self.manifest)
         try:
             for _ in range(2):
-                command_of(self._answers([self._memory], [seen])[0], rule=self.manifest.waypoints, robot=seen.robot)
-            told = self.graph.ask(self._memory.feeder.feed(seen), self._names)
+                answer = self._answers(graph, [self._memory], [seen])[0]
+                command_of(answer, rule=self.manifest.waypoints, robot=seen.robot)
+            told = graph.ask(self._memory.feeder.feed(seen), self._names)
             return b"".join(told[name].tobytes() for name in self._names)
         except UsageError:
             raise
         except PolicyError as error:
-            raise UsageError(f"{path}: in a grey street the policy {error}: are its weights whole?") from error
+            raise UsageError(f"{graph.path}: in a grey street the policy {error}: are its weights whole?") from error
         except Exception as error:
-            raise UsageError(f"{path}: cannot be run by onnxruntime: {said_by_runtime(error)}") from error
+            raise UsageError(f"{graph.path}: cannot be run by onnxruntime: {said_by_runtime(error)}") from error
 
 
 class OnnxBatchPolicy(OnnxPolicy):
     """The same for many episodes at once (`cosim.episode.ports.BatchPolicy`)."""
 
-    def __init__(self, place: Path) -> None:
-        super().__init__(place)
+    def __init__(self, place: Path, within_s: float | None = LOADED_WITHIN_S) -> None:
+        super().__init__(place, within_s)
         self._memories: dict[str, _Memory] = {}
 
     def reset(self, episode_id: str, seed: int) -> None:
@@ -165,7 +181,7 @@ class OnnxBatchPolicy(OnnxPolicy):
 
     def act_batch(self, observations: Sequence[Observation]) -> list[PolicyAnswer]:
         """For each observation what `act` would answer, up to what the processor makes of the last bits."""
-        return self._answers([self._memories[one.episode] for one in observations], observations)
+        return self._answers(self.graph, [self._memories[one.episode] for one in observations], observations)
 
 
 def in_grey(manifest: Manifest) -> Observation:
@@ -219,7 +235,10 @@ def example_differences(policy: OnnxPolicy) -> dict[str, float]:
                 f"{path}: does not fit the graph: '{name}' is {array.dtype.name} {array.shape}, and {wanted_is}"
             )
     try:
-        told = policy.graph.ask({name: held[name] for name in policy.graph.inputs}, list(policy.graph.outputs))
+        with policy.on_trial() as graph:
+            told = graph.ask({name: held[name] for name in graph.inputs}, list(graph.outputs))
+    except UsageError:
+        raise
     except Exception as error:
         raise UsageError(f"{path}: does not fit the graph: {said_by_runtime(error)}") from error
     for name, array in wanted.items():

@@ -26,10 +26,12 @@ _PIECE_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class BundleFiles:
-    """A graph's file, and the BLAKE2b of it, of the files that it names, and of those that the manifest names."""
+    """A graph's file; the BLAKE2b of it, of the files that it names, and of those that the manifest names; and how many
+    bytes all of these hold."""
 
     graph: Path
     digest: str
+    size: int
 
 
 @dataclass(frozen=True)
@@ -89,13 +91,13 @@ def bundle_files(folder: Path, manifest: BundleManifest) -> BundleFiles:
     if bad:
         more = f" and {len(bad) - 3} more" if len(bad) > 3 else ""
         raise UsageError(f"{graph}: weights are NaN or infinite: {', '.join(bad[:3])}{more}; export it anew")
-    digest = hashlib.blake2b(digest_size=32)
+    digest, size = hashlib.blake2b(digest_size=32), 0
     for name in dict.fromkeys([manifest.model, *beside, *manifest.files]):
         if name in beside and (refusal := refusal_of_name(name)):
             raise UsageError(f"{graph}: has weights in a file beside it: {refusal}")
         path = _inside(graph.with_name(name), graph.parent) if name in beside else _found(folder, manifest, name)
-        _digested(path, name, manifest, digest)
-    return BundleFiles(graph, digest.hexdigest())
+        size += _digested(path, name, manifest, digest)
+    return BundleFiles(graph, digest.hexdigest(), size)
 
 
 def _found(folder: Path, manifest: BundleManifest, name: str) -> Path:
@@ -130,8 +132,9 @@ def _read_in_words(path: Path) -> Iterator[None]:
         raise UsageError(f"{path}: {error}") from error
 
 
-def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> None:
-    """Take a file into a digest, piece by piece. Raises UsageError for one that is another than its manifest says."""
+def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.blake2b) -> int:
+    """Take a file into a digest, piece by piece, and return its size. Raises UsageError for one that is another than
+    its manifest says."""
     said = manifest.files.get(path.name)
     told: dict[str, int | str] = {} if said is None else {"bytes": said.bytes, **said.hashes}
 
@@ -155,3 +158,4 @@ def _digested(path: Path, name: str, manifest: BundleManifest, digest: hashlib.b
                     sha256.update(piece)
     check("blake2b", blake2b.hexdigest())
     check("sha256", sha256.hexdigest())
+    return size

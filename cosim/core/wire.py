@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 import struct
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from typing import Final
@@ -44,10 +45,11 @@ class Wire:
             while self._unsent:
                 del self._unsent[: self._end.send(self._unsent)]
 
-    def receive(self) -> bytes:
-        """The next message, waited for. Raises EOFError when none will come."""
-        self._end.settimeout(None)
+    def receive(self, within_s: float | None = None) -> bytes:
+        """The next message, waited for. Raises EOFError when none will come, TimeoutError when it takes too long."""
+        until_s = None if within_s is None else time.monotonic() + within_s
         while (message := self._next()) is None:
+            self._end.settimeout(None if until_s is None else max(until_s - time.monotonic(), 1e-3))
             self._take()
         return message
 
