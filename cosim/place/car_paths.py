@@ -25,11 +25,14 @@ def paths_near(street_map: StreetMap, area: shapely.Geometry) -> list[shapely.Li
 
 
 def from_car_paths_m(street_map: StreetMap, xy: Floats) -> Floats:
-    """(N,) m: from (N, 2) points to the nearest middle line on which cars drive inside a junction; inf beyond 4 m."""
-    points = np.asarray(shapely.points(xy), dtype=object)
-    lines = paths_near(street_map, shapely.buffer(shapely.MultiPoint(xy), _NEAR_M))
+    """(N,) m: from (N, 2) points, one after the other along a way, to the nearest middle line on which cars drive
+    inside a junction; inf beyond 4 m."""
     far_m = np.full(len(xy), np.inf)
+    if len(xy) < 2:
+        return far_m
+    lines = paths_near(street_map, shapely.buffer(shapely.LineString(xy), _NEAR_M, quad_segs=2))
     if lines:
+        points = np.asarray(shapely.points(xy), dtype=object)
         near, gap_m = shapely.STRtree(lines).query_nearest(
             points, max_distance=_NEAR_M, return_distance=True, all_matches=False
         )

@@ -1,9 +1,10 @@
-"""What a place is worth: its size, what can be walked, what is wrong with it, which scenarios it can hold."""
+"""What a place is: its size, what can be walked, what is wrong with it. `scenarios/builders/capacity.py` says which
+scenarios it can hold."""
 
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import msgspec
 import numpy as np
@@ -11,7 +12,8 @@ import shapely
 
 from cosim.core.geometry import Floats, Polyline
 from cosim.place import overlay
-from cosim.place.street_map import Lane, Port, StreetMap, Strip
+from cosim.place.car_paths import corners_driven_over
+from cosim.place.street_map import Lane, StreetMap, Strip
 from cosim.place.terrain import ROBOT_GRADE_MAX, WALK_GRADE_MAX, Elevation
 from cosim.place.walk_graph import WalkGraph
 
@@ -21,12 +23,8 @@ STUB_M = 1.0
 STEEP = 0.08
 """Grade from which a walkable lane counts as steep."""
 MOSTLY = 0.5
-START_M = 30.0
-"""Routes start and end on sidewalks at least this long."""
-UNIT_WIDE_M = 1.5
-ROUTE_M = (120.0, 560.0)
-"""Shortest and longest way of a long-horizon route."""
-PROBES = 24
+LARGEST = 0.6
+"""Scenarios are drawn on the largest island alone: one with less of the length than this is warned of."""
 
 
 class NetFacts(msgspec.Struct, frozen=True, kw_only=True):
@@ -74,23 +72,25 @@ class Island(msgspec.Struct, frozen=True):
 
 
 class Problem(msgspec.Struct, frozen=True):
-    """Something wrong at one strip.
+    """Something wrong at one strip or corner.
 
-    kind: island, narrow, on_road, stacked, steep, never_green, always_green, level or misfit.
+    kind: island, narrow, on_road, stacked, driven_over, steep, never_green, always_green, level or misfit.
     """
 
     kind: str
-    strip: str
+    piece: str
     x_m: float
     y_m: float
 
 
 class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
-    """What was found. reasons: why the map cannot be used, none when it can; notes: what a user should know.
+    """What was found. reasons: why nothing can be drawn on the map, none where something may be; warnings: what to
+    change; notes: what a user should know.
 
     walkable_km: length of sidewalks and shared paths, crossings apart. overlap_share: part of the sidewalks' area that
     lies on lanes of roads; on_road: sidewalks that do so mostly; stacked: those that cross a road where there is no
-    crossing. guessed_share: part of the sidewalks' length that the importer made up; None if unknown.
+    crossing; driven_over: corners over which cars turn. guessed_share: part of the sidewalks' length that the importer
+    made up; None if unknown.
     features: how many buildings and things of each kind the map itself shows.
     """
 
@@ -113,12 +113,12 @@ class MapCheck(msgspec.Struct, frozen=True, kw_only=True):
     overlap_share: float
     on_road: int
     stacked: int
+    driven_over: int
     guessed_share: float | None
     elevation: Elevation | None
     facts: NetFacts | None
-    unit_possible: bool
-    long_horizon_possible: bool
     reasons: tuple[str, ...]
+    warnings: tuple[str, ...]
     notes: tuple[str, ...]
     problems: tuple[Problem, ...]
     features: dict[str, int]
@@ -145,14 +145,14 @@ def check_map(
     on_road = [s for s, part in zip(sidewalks, share, strict=True) if part > MOSTLY]
     stacked = [s for s in stacked_on_roads(street_map, sidewalks) if s not in on_road]
     narrow = [s for s in sidewalks if s.width_m < _NARROW_M]
-    unit = _unit_reasons(street_map, graph, lengths)
-    long_horizon = _long_horizon_reasons(street_map, graph, lengths)
-    reasons = _unusable(street_map, unit, long_horizon)
+    driven_over = corners_driven_over(street_map)
+    islands = _islands(graph, lengths)
     marked = [
         *_marks("island", [s for s in strips if s.id not in graph.main_strips]),
         *_marks("narrow", narrow),
         *_marks("on_road", on_road),
         *_marks("stacked", stacked),
+        *_marks_of_corners("driven_over", driven_over),
         *_marks("steep", [s for s in strips if s.id in street_map.steep]),
     ]
     if facts is not None:
@@ -171,7 +171,7 @@ def check_map(
         corners=len(street_map.corners),
         roads_km=sum(_length_m(lane) for lane in street_map.lanes.values() if _is_road(lane)) / 1000.0,
         left_hand=street_map.left_hand,
-        islands=_islands(graph, lengths),
+        islands=islands,
         narrow=len(narrow),
         narrow_km=sum(lengths[s.id] for s in narrow) / 1000.0,
         narrowest_m=min((s.width_m for s in sidewalks), default=0.0),
@@ -180,16 +180,16 @@ def check_map(
         overlap_share=float((share * areas).sum() / areas.sum()) if areas.sum() > 0.0 else 0.0,
         on_road=len(on_road),
         stacked=len(stacked),
+        driven_over=len(driven_over),
         guessed_share=guessed_share,
         elevation=street_map.elevation,
         facts=facts,
-        unit_possible=not unit,
-        long_horizon_possible=not long_horizon,
-        reasons=tuple(reasons),
+        reasons=tuple(_unusable(street_map)),
+        warnings=tuple(_torn(islands)),
         notes=(
-            *(() if reasons else (*unit, *long_horizon)),
             *_land_notes(street_map),
             *_stairs(sidewalks),
+            *_driven_over_notes(driven_over),
             *_notes(facts),
         ),
         problems=tuple(marked),
@@ -235,6 +235,11 @@ def _marks(kind: str, strips: Sequence[Strip]) -> list[Problem]:
     return [Problem(kind, s.id, round(at.x_m, 2), round(at.y_m, 2)) for s, at in middles]
 
 
+def _marks_of_corners(kind: str, grounds: Mapping[str, shapely.Geometry]) -> list[Problem]:
+    spots = shapely.get_coordinates([shapely.point_on_surface(ground) for ground in grounds.values()]).tolist()
+    return [Problem(kind, name, round(x_m, 2), round(y_m, 2)) for name, (x_m, y_m) in zip(grounds, spots, strict=True)]
+
+
 def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
     """The connected parts, longest first."""
     labels = graph.component[::2]
@@ -247,49 +252,34 @@ def _islands(graph: WalkGraph, lengths: dict[str, float]) -> tuple[Island, ...]:
     return tuple(Island(int(counts[i]), float(metres[i]) / 1000.0, float(metres[i]) / total) for i in order)
 
 
-def _starts(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[Strip]:
-    return [
-        s
-        for s in street_map.strips.values()
-        if s.id in graph.main_strips and s.kind == "sidewalk" and lengths[s.id] >= START_M and s.width_m >= _NARROW_M
-        if s.id not in street_map.steep
-    ]
-
-
-def _unit_reasons(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[str]:
-    if not any(s.width_m >= UNIT_WIDE_M for s in _starts(street_map, graph, lengths)):
-        return [f"no unit scenarios: no connected sidewalk is {START_M:g} m long and {UNIT_WIDE_M:g} m wide"]
-    if not any(street_map.strips[s].kind == "crossing" for s in graph.main_strips):
-        return ["no unit scenarios: the longest island has no crossing"]
-    return []
-
-
-def _long_horizon_reasons(street_map: StreetMap, graph: WalkGraph, lengths: dict[str, float]) -> list[str]:
-    starts = _starts(street_map, graph, lengths)
-    ends = {s.id for s in starts}
-    for start in starts[:: max(1, len(starts) // PROBES)]:
-        for end in (0, 1):
-            leave = Port(start.id, 1 if end else 0)
-            reach = graph.reach(leave, street_map.too_steep | {leave.other}, limit_m=ROUTE_M[1])
-            for goal in reach.within(*ROUTE_M):
-                way = reach.path(goal) if goal.strip in ends else None
-                if way and any(street_map.strips[port.strip].kind == "crossing" for port in way):
-                    return []
-    low, high = ROUTE_M
-    return [f"no long-horizon scenarios: no way of {low:g} to {high:g} m over a crossing joins two long sidewalks"]
-
-
-def _unusable(street_map: StreetMap, unit: list[str], long_horizon: list[str]) -> list[str]:
+def _unusable(street_map: StreetMap) -> list[str]:
     if not street_map.strips:
         return ["nothing is walkable: no sidewalk, path or crossing"]
     if not street_map.corners:
         return ["its sidewalks are not connected: the net has no walking areas; import it without --as-is"]
-    return [*unit, *long_horizon] if unit and long_horizon else []
+    return []
+
+
+def _torn(islands: Sequence[Island]) -> list[str]:
+    if not islands or islands[0].share >= LARGEST:
+        return []
+    return [
+        f"the largest of {len(islands)} islands of connected walkways has {islands[0].share:.0%} of their length: "
+        "scenarios are drawn on it alone, the rest stays unused. Import another part (--bbox), whose streets have "
+        "sidewalks and crossings; a SUMO net without --as-is; or a file that was not cut through its streets. "
+        "-o map.png draws the islands"
+    ]
 
 
 def _stairs(sidewalks: Sequence[Strip]) -> list[str]:
     steps = [s.id for s in sidewalks if s.going == "steps"]
     return [f"{len(steps)} walkable edges are stairs, flat here: routes keep off them"] if steps else []
+
+
+def _driven_over_notes(corners: Mapping[str, object]) -> list[str]:
+    if not corners:
+        return []
+    return [f"cars turn over {len(corners)} corners, crossings apart: routes keep off there: {_some([*corners])}"]
 
 
 def _notes(facts: NetFacts | None) -> list[str]:

@@ -13,6 +13,10 @@ from cosim.core.errors import MapError
 from cosim.core.geometry import Floats, Polyline
 from cosim.place.street_map import Port, StreetMap, Strip, union_closed
 
+START_M = 30.0
+"""Long routes start and end on sidewalks at least this long."""
+ROUTE_M = (120.0, 560.0)
+"""Shortest and longest way of a long-horizon route."""
 MARGINS_M = (0.6, 0.45, 0.3, 0.15, 0.02)
 """Distances from the edge of a corner that are tried for the line through it, widest first."""
 

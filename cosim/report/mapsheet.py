@@ -23,6 +23,7 @@ MARKS: Final[dict[str, tuple[Rgb255, str]]] = {
     "narrow": ((230, 140, 0), "narrower than 1 m"),
     "on_road": ((220, 0, 0), "mostly on the road"),
     "stacked": ((250, 90, 60), "over or under a road"),
+    "driven_over": ((150, 0, 90), "cars turn over the corner"),
     "never_green": ((120, 0, 0), "signal never green"),
     "always_green": ((0, 120, 200), "signal always green"),
     "misfit": ((90, 60, 30), "signal without a program that fits"),
@@ -45,8 +46,8 @@ def draw_map(street_map: StreetMap, check: MapCheck, part: tuple[float, float, f
             sheet.dot(middle[None], SIGNAL, 1.2)
     for problem in check.problems:
         colour, _ = MARKS[problem.kind]
-        marked = street_map.strips[problem.strip]
-        sheet.line(marked.line[:, :2], colour, 1.0)
+        if problem.piece in street_map.strips:
+            sheet.line(street_map.strips[problem.piece].line[:, :2], colour, 1.0)
         sheet.dot(np.array([[problem.x_m, problem.y_m]]), colour, 4.0, filled=False)
     _scale_bar(sheet, bounds)
     return legend(sheet.image, _facts(check))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable
-from typing import Final
+from typing import Final, TypeVar
 
 import msgspec
 import numpy as np
@@ -21,6 +21,8 @@ TRIES: Final = 400
 PERSON_M2: Final = 25.0
 """Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
 _SAMPLE_M: Final = 20.0
+
+_Drawn = TypeVar("_Drawn")
 
 
 class Refusals:
@@ -51,8 +53,8 @@ def first_that_fits(draw: Callable[[], Scenario], failure: str) -> Scenario:
     return found
 
 
-def first_of(draws: Iterable[Callable[[], Scenario]], refusals: Refusals) -> Scenario | None:
-    """The first scenario that is not refused, None when all are; refusals are counted."""
+def first_of(draws: Iterable[Callable[[], _Drawn]], refusals: Refusals) -> _Drawn | None:
+    """The first draw that is not refused, None when all are; refusals are counted."""
     for draw in draws:
         try:
             return draw()

@@ -13,8 +13,8 @@ from shapely.geometry import LineString
 from cosim.core.errors import MapError, SpecError
 from cosim.core.geometry import Polyline
 from cosim.place.car_paths import CAR_M, from_car_paths_m
-from cosim.place.map_check import ROUTE_M, START_M, on_road_shares
-from cosim.place.route_line import way_line
+from cosim.place.map_check import on_road_shares
+from cosim.place.route_line import ROUTE_M, START_M, way_line
 from cosim.place.street_map import Lane, Port, StreetMap
 from cosim.place.walk_graph import WalkGraph
 from cosim.spec.event_kind import EventKinds
@@ -75,11 +75,6 @@ class _Draft(NamedTuple):
     kinds: EventKinds
     length_m: float | None
 
-    @property
-    def half_width_m(self) -> float:
-        """Half of what the way is wide, at least."""
-        return self.robot.width_m / 2 + WAY_SPARE_M
-
 
 _Fences = Callable[[StreetMap, Polyline, Sequence[Port], float], tuple[Barrier, ...]]
 
@@ -99,12 +94,7 @@ def build_long_horizon(
 
     Raises SpecError with the reason that stands in the way most often, and what would help."""
     rng = np.random.default_rng([seed, place.seed, 0x10E6])
-    candidates = sorted(
-        strip_id
-        for strip_id in graph.main_strips
-        if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= START_M
-        if strip_id not in street_map.steep
-    )
+    candidates = starts(street_map, graph)
     if not candidates:
         raise MapError(f"map '{street_map.name}' has no sidewalk of {START_M:g} m to start on")
     draft = _Draft(place, street_map, graph, seed, scenario_id, robot, kinds, length_m)
@@ -122,28 +112,22 @@ def build_long_horizon(
     return found
 
 
+def starts(street_map: StreetMap, graph: WalkGraph) -> list[str]:
+    """The sidewalks on which long ways start and end."""
+    return sorted(
+        strip_id
+        for strip_id in graph.main_strips
+        if street_map.strips[strip_id].kind == "sidewalk" and street_map.strips[strip_id].length_m >= START_M
+        if strip_id not in street_map.steep
+    )
+
+
 def _along(
     draft: _Draft, rng: np.random.Generator, drawn: tuple[Sequence[Port], float, float], fences: _Fences
 ) -> Scenario:
     """The scenario along a way, as `draw_way` gives it. Raises SpecError when the way does not do."""
-    (way, *ends_m), street_map = drawn, draft.street_map
-    route = _line(street_map, way, *ends_m)
-    if draft.length_m is not None:
-        # Corners are cut: what that saves is walked on the last sidewalk.
-        ends_m[1] += draft.length_m - route.length_m
-        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
-            raise SpecError("no goal at the wanted distance")
-        route = _line(street_map, way, *ends_m)
-        if abs(route.length_m - draft.length_m) > LENGTH_SLACK_M:
-            raise SpecError("the line is not of the wanted length")
-    if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
-        raise SpecError("length of the line does not fit")
-    crossings = route_crossings(street_map, route, way)
-    if on_road_m(street_map, route, crossings) > ON_ROAD_M:
-        raise SpecError("the way lies on a road: cars drive through who walks there")
-    if on_car_paths_m(street_map, route, crossings, draft.robot) > TURNED_OVER_M:
-        raise SpecError("cars turn over the way")
-    barriers = fences(street_map, route, way, draft.half_width_m)
+    way, street_map = drawn[0], draft.street_map
+    route, crossings, barriers = lone_route(street_map, drawn, fences, draft.robot, draft.length_m)
     bare = bare_scenario(
         route,
         crossings,
@@ -160,6 +144,36 @@ def _along(
     return with_obstacles(msgspec.structs.replace(bare, **parts), street_map)
 
 
+def lone_route(
+    street_map: StreetMap,
+    drawn: tuple[Sequence[Port], float, float],
+    fences: _Fences,
+    robot: Robot,
+    length_m: float | None = None,
+) -> tuple[Polyline, tuple[RouteCrossing, ...], tuple[Barrier, ...]]:
+    """The route along a way, as `draw_way` gives it, its crossings, and fences that leave no other route.
+
+    Raises SpecError when the way does not do."""
+    way, *ends_m = drawn
+    route = _line(street_map, way, *ends_m)
+    if length_m is not None:
+        # Corners are cut: what that saves is walked on the last sidewalk.
+        ends_m[1] += length_m - route.length_m
+        if not _END_M <= ends_m[1] <= street_map.strips[way[-1].strip].length_m - _END_M:
+            raise SpecError("no goal at the wanted distance")
+        route = _line(street_map, way, *ends_m)
+        if abs(route.length_m - length_m) > LENGTH_SLACK_M:
+            raise SpecError("the line is not of the wanted length")
+    if not ROUTE_M[0] <= route.length_m <= 1.2 * ROUTE_M[1]:
+        raise SpecError("length of the line does not fit")
+    crossings = route_crossings(street_map, route, way)
+    if on_road_m(street_map, route, crossings) > ON_ROAD_M:
+        raise SpecError("the way lies on a road: cars drive through who walks there")
+    if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
+        raise SpecError("cars turn over the way")
+    return route, crossings, fences(street_map, route, way, robot.width_m / 2 + WAY_SPARE_M)
+
+
 def _line(street_map: StreetMap, way: Sequence[Port], start_m: float, goal_m: float) -> Polyline:
     """The route along a way, in whole centimetres."""
     return Polyline(np.round(way_line(street_map, way, start_m, goal_m).points, 2))
@@ -169,9 +183,7 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
     """More draws: of ways that keep off roads, stairs and bridges, fenced in all along where need be."""
     street_map = draft.street_map
     rng = np.random.default_rng([draft.seed, draft.place.seed, 0x10E6, 1])
-    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
-    shares = dict(zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True))
-    avoided = {s.id for s in street_map.strips.values() if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE}
+    avoided = avoided_strips(street_map)
     usable = [strip for strip in candidates if strip not in avoided]
 
     def draw() -> Scenario:
@@ -181,6 +193,13 @@ def _search(draft: _Draft, candidates: Sequence[str]) -> Iterator[Callable[[], S
         return _along(draft, rng, found, fences_along)
 
     return (draw for _ in range(SEARCHES if usable else 1))
+
+
+def avoided_strips(street_map: StreetMap) -> set[str]:
+    """The strips that no way is searched over: stairs, bridges, tunnels, and sidewalks on roads."""
+    sidewalks = [strip for strip in street_map.strips.values() if strip.kind == "sidewalk"]
+    shares = dict(zip([s.id for s in sidewalks], on_road_shares(street_map, sidewalks), strict=True))
+    return {s.id for s in street_map.strips.values() if s.going != "plain" or shares.get(s.id, 0.0) > AVOIDED_SHARE}
 
 
 def fences_along(

@@ -60,19 +60,13 @@ def build_reactive(
 ) -> Scenario:
     """A scenario of one kind of event drawn from `seed`. Raises SpecError when no place for it is found."""
     rng = np.random.default_rng([seed, place.seed, 0x4EAC7, zlib.crc32(kind.name.encode())])
-    wanted = "crossing" if kind.layout is None else "sidewalk"
-    even = sorted(graph.main_strips - street_map.steep)
-    strips = [street_map.strips[s] for s in even if street_map.strips[s].kind == wanted]
+    strips = strips_of(kind, street_map, graph)
     if not strips:
+        wanted = "crossing" if kind.layout is None else "sidewalk"
         raise MapError(f"map '{street_map.name}' has no {wanted} for '{kind.name}'")
 
     def draw() -> Scenario:
-        strip, layout = strips[int(rng.integers(len(strips)))], kind.layout
-        at = (
-            over_crossing(street_map, strip, rng, robot)
-            if layout is None
-            else along_sidewalk(layout, strip, rng, robot)
-        )
+        at = event_spot(kind, strips[int(rng.integers(len(strips)))], street_map, rng, robot)
         bare = bare_scenario(
             Polyline(at.route),
             at.crossings,
@@ -90,6 +84,22 @@ def build_reactive(
         return with_obstacles(whole, street_map, beside=True)
 
     return first_that_fits(draw, f"no place for '{kind.name}' on '{street_map.name}' with seed {seed}")
+
+
+def strips_of(kind: EventKind, street_map: StreetMap, graph: WalkGraph) -> list[Strip]:
+    """The strips on which a kind of event may be, as far as can be told without drawing, by their ids."""
+    wanted = "crossing" if kind.layout is None else "sidewalk"
+    strips = [street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)]
+    return [strip for strip in strips if strip.kind == wanted and strip.going == "plain"]
+
+
+def event_spot(
+    kind: EventKind, strip: Strip, street_map: StreetMap, rng: np.random.Generator, robot: Robot
+) -> EventSpot:
+    """A way drawn along a strip and the place of an event on it. Raises SpecError where it does not fit."""
+    if kind.layout is None:
+        return over_crossing(street_map, strip, rng, robot)
+    return along_sidewalk(kind.layout, strip, rng, robot)
 
 
 def _event_at(kind: EventKind, at: EventSpot, rng: np.random.Generator, robot: Robot) -> Event:
@@ -110,21 +120,22 @@ def _event_at(kind: EventKind, at: EventSpot, rng: np.random.Generator, robot: R
 
 def along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generator, robot: Robot) -> EventSpot:
     half_m = strip.width_m / 2
-    if half_m < layout.half_width_m + wider_m(robot):
-        raise SpecError("sidewalk too narrow")
+    least_m = layout.half_width_m + wider_m(robot)
+    if half_m < least_m:
+        raise SpecError(f"the sidewalk is narrower than {2.0 * least_m:.2g} m")
     way_m, event_m = float(rng.uniform(*layout.way_m)), float(rng.uniform(*layout.event_m))
     reach_m = max(way_m, event_m)
     line = strip.line[:, :2] if rng.random() < 0.5 else strip.line[::-1, :2]
     middle = Polyline(line)
     room_m = middle.length_m - reach_m - 2 * ENDS_CLEAR_M
     if room_m < 0.0:
-        raise SpecError("sidewalk too short")
+        raise SpecError("the sidewalk is too short")
     start_m = ENDS_CLEAR_M + float(rng.uniform(0.0, room_m))
     ends = middle.at(start_m).xy, middle.at(start_m + reach_m).xy
     chord = Polyline(np.stack(ends))
     between = middle.points[(middle.s_m > start_m) & (middle.s_m < start_m + reach_m)]
     if any(abs(chord.project(x, y)[1]) > BEND_M for x, y in between.tolist()):
-        raise SpecError("sidewalk not straight")
+        raise SpecError("the sidewalk is not straight")
     steps = np.append(np.arange(0.0, way_m - 0.5, 1.0), way_m)
     route = np.round([chord.at(float(s)).xy for s in steps], 3)
     return EventSpot(route, chord.at(min(event_m, chord.length_m)), event_m, half_m)
@@ -133,9 +144,9 @@ def along_sidewalk(layout: SidewalkLayout, strip: Strip, rng: np.random.Generato
 def over_crossing(street_map: StreetMap, strip: Strip, rng: np.random.Generator, robot: Robot) -> EventSpot:
     leave: Literal[0, 1] = 1 if rng.random() < 0.5 else 0
     if not 5.0 <= strip.length_m <= 12.0 or None in strip.corners:
-        raise SpecError("crossing too short or too long")
+        raise SpecError("the crossing is too short or too long")
     if strip.signalised:
-        raise SpecError("crossing signalised: waiting there takes longer than the episode")
+        raise SpecError("the crossing has signals: waiting there takes longer than the episode")
     ends = strip.line[[0, -1], :2] if leave else strip.line[[-1, 0], :2]
     route = Polyline(np.round(_straight_over(street_map, ends, _ROOM_M + 0.5 * wider_m(robot)), 3)).resampled(0.99)
     route = Polyline(np.round(route.points, 3))
@@ -160,7 +171,7 @@ def _straight_over(street_map: StreetMap, ends: Floats, room_m: float) -> Floats
                 reached.append(end + far_m * outward)
                 break
         else:
-            raise SpecError("no room straight on beside the crossing")
+            raise SpecError("there is no room straight on beside the crossing")
     if np.hypot(*(reached[1] - reached[0])) < _SHORTEST_M:
-        raise SpecError("way over the crossing too short")
+        raise SpecError("the way over the crossing is too short")
     return np.array(reached)

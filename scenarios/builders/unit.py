@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
 from typing import Final, Literal, get_args
 
@@ -36,8 +36,6 @@ _OFF_ROAD_M: Final = 0.5
 _BESIDE_ROBOT_M: Final = 0.7
 """Sidewalks are wider than the robot by this on either side: there is room for something that stands there."""
 
-_Draw = Callable[[Strip], tuple[Polyline, tuple[RouteCrossing, ...]]]
-
 
 def build_unit(
     structure: Structure,
@@ -53,28 +51,15 @@ def build_unit(
     as common ones. way_m: of a straight way, shortest and longest. Raises SpecError when no place for it is found."""
     named = zlib.crc32(f"{structure} {place.name}".encode())
     rng = np.random.default_rng([seed, place.seed, 0x0417, named])
-    wanted = "crossing" if structure == "crosswalk" else "sidewalk"
     classes: dict[str, list[Strip]] = {}
-    for strip_id in sorted(graph.main_strips - street_map.steep):
-        strip = street_map.strips[strip_id]
-        if strip.kind == wanted and strip.going == "plain" and _may_be(strip, structure, robot):
-            classes.setdefault(strip.street_class, []).append(strip)
+    for strip in strips_for(structure, street_map, graph, robot):
+        classes.setdefault(strip.street_class, []).append(strip)
     if not classes:
-        raise MapError(f"map '{street_map.name}' has no {wanted} for '{structure}'")
-    ways: dict[Structure, _Draw] = {
-        "straight": lambda strip: _straight(strip, rng, robot, way_m),
-        "curve": lambda strip: (_round_corner(street_map, graph, strip, rng, robot), ()),
-        "crosswalk": lambda strip: _crosswalk(street_map, strip, rng, robot),
-    }
+        raise MapError(f"map '{street_map.name}' has no {lies_on(structure)} for '{structure}'")
 
     def draw(strips: list[Strip]) -> Scenario:
-        route, crossings = ways[structure](strips[int(rng.integers(len(strips)))])
-        if not way_m[0] <= route.length_m <= way_m[1]:
-            raise SpecError("the way is too short or too long")
-        if on_road_m(street_map, route, crossings) > _OFF_ROAD_M:
-            raise SpecError("the way lies on a road")
-        if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
-            raise SpecError("cars turn over the way")
+        strip = strips[int(rng.integers(len(strips)))]
+        route, crossings = drawn_along(structure, strip, street_map, graph, rng, robot, way_m)
         bare = bare_scenario(
             route,
             crossings,
@@ -94,6 +79,43 @@ def build_unit(
         if found := first_of((partial(draw, classes[name]) for _ in range(TRIES)), refusals):
             return found
     raise SpecError(f"no place for '{structure}' on '{street_map.name}' with seed {seed}: {refusals}")
+
+
+def lies_on(structure: Structure) -> Literal["sidewalk", "crossing"]:
+    """What a structure is drawn on."""
+    return "crossing" if structure == "crosswalk" else "sidewalk"
+
+
+def strips_for(structure: Structure, street_map: StreetMap, graph: WalkGraph, robot: Robot) -> list[Strip]:
+    """The strips on which a structure may be, as far as can be told without drawing, by their ids."""
+    strips = [street_map.strips[strip_id] for strip_id in sorted(graph.main_strips - street_map.steep)]
+    usable = [strip for strip in strips if strip.kind == lies_on(structure) and strip.going == "plain"]
+    return [strip for strip in usable if _may_be(strip, structure, robot)]
+
+
+def drawn_along(
+    structure: Structure,
+    strip: Strip,
+    street_map: StreetMap,
+    graph: WalkGraph,
+    rng: np.random.Generator,
+    robot: Robot,
+    way_m: tuple[float, float] = WAY_M,
+) -> tuple[Polyline, tuple[RouteCrossing, ...]]:
+    """A route drawn along a strip, and its crossings. Raises CosimError where it does not do."""
+    if structure == "straight":
+        route, crossings = _straight(strip, rng, robot, way_m)
+    elif structure == "curve":
+        route, crossings = _round_corner(street_map, graph, strip, rng, robot), ()
+    else:
+        route, crossings = _crosswalk(street_map, strip, rng, robot)
+    if not way_m[0] <= route.length_m <= way_m[1]:
+        raise SpecError("the way is too short or too long")
+    if on_road_m(street_map, route, crossings) > _OFF_ROAD_M:
+        raise SpecError("the way lies on a road")
+    if on_car_paths_m(street_map, route, crossings, robot) > TURNED_OVER_M:
+        raise SpecError("cars turn over the way")
+    return route, crossings
 
 
 def turn_rad(route: Polyline) -> float:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from typing import Annotated, Final, Literal
 
 from cosim.core.errors import SpecError
-from cosim.place.map_check import ROUTE_M
+from cosim.place.route_line import ROUTE_M
 from cosim.spec.goal import GoalProtocol
 from cosim.spec.obstacle import OBSTACLE_VARIANTS, Obstacle, ObstacleKind
 from cosim.spec.ranges import ALONG_M, SEED, WHERE_M, Named, Points, Ranged, Text, Within

@@ -80,7 +80,7 @@ def test_figures_of_a_made_up_place() -> None:
     assert (check.stubs, check.dead_ends) == (1, 10)
     assert check.overlap_share == pytest.approx((80 + 12) / (400 + 400 + 40 + 140 + 80 + 1))
     assert (check.on_road, check.stacked) == (1, 1)
-    found = {(problem.kind, problem.strip) for problem in check.problems}
+    found = {(problem.kind, problem.piece) for problem in check.problems}
     assert found == {
         *(("island", name) for name in ("alley", "bridge", "gutter", "stub")),
         ("narrow", "alley"),
@@ -89,19 +89,32 @@ def test_figures_of_a_made_up_place() -> None:
     }
 
 
-def test_a_place_is_usable_when_one_kind_of_scenario_fits() -> None:
-    """Two long sidewalks and a crossing between them do for both kinds; shorter ones for none."""
-    check = check_map(town())
-    assert check.usable and check.unit_possible and check.long_horizon_possible and not check.reasons
-    small = town()
-    short = {
-        name: dataclasses.replace(s, line=s.line * [0.1, 1.0] + [180.0, 0.0])
-        for name, s in small.strips.items()
-        if name in ("south", "north")
-    }
-    check = check_map(dataclasses.replace(small, strips={**small.strips, **short}))
-    assert not check.usable and not check.unit_possible and not check.long_horizon_possible
-    assert "no unit scenarios" in check.reasons[0] and "no way of 120 to 560 m" in check.reasons[1]
+def test_corners_that_cars_drive_over_are_counted_and_listed() -> None:
+    """A path of cars inside a junction that leads over a corner is one; over a crossing alone, or of bicycles, none."""
+    clear = town()
+    turn = road("turn", (199, -0.5), (201, 1), (201, 11), internal=True)
+    check = check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": turn}))
+    assert (
+        check.driven_over == 1
+        and "cars turn over 1 corners" in "".join(check.notes)
+        and check_map(clear).driven_over == 0
+    )
+    (marked,) = [problem for problem in check.problems if problem.kind == "driven_over"]
+    assert (marked.piece, round(marked.x_m), abs(round(marked.y_m))) == ("cs", 200, 0)
+    bicycles = dataclasses.replace(turn, cars=False)
+    over = road("over", (201, 2), (201, 10), internal=True)
+    for lane in (bicycles, over):
+        assert check_map(dataclasses.replace(clear, lanes={**clear.lanes, "turn_0": lane})).driven_over == 0
+
+
+def test_a_place_in_pieces_is_warned_of() -> None:
+    """Where the largest island has less than 60 % of the length the check says what that means and what to do."""
+    whole = town()
+    assert check_map(whole).warnings == ()
+    far = strip("far", (0, 90), (400, 90))
+    (warning,) = check_map(dataclasses.replace(whole, strips={**whole.strips, "far": far})).warnings
+    assert warning.startswith("the largest of 6 islands of connected walkways has 42% of their length: scenarios are")
+    assert "Import another part (--bbox)" in warning
 
 
 def test_places_without_walks_or_corners_are_not_usable() -> None:
@@ -179,7 +192,7 @@ def test_notes_say_what_is_not_used() -> None:
     assert "elevation 0 to 90 m is dropped, the ground is flat: it is the same" in check_map(false).notes[-1]
     kept = dataclasses.replace(town(), elevation=dataclasses.replace(land, steep=(next(iter(town().strips)),)))
     notes = "\n".join(check_map(kept, None, facts_of(net())).notes)
-    assert [p.strip for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
+    assert [p.piece for p in check_map(kept).problems if p.kind == "steep"] == list(kept.steep)
     for words in (
         "elevation 0 to 90 m is kept; 7 of 50 points had none or a false one",
         "3 places on streets were moved, by up to 1.2 m",

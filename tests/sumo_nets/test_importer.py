@@ -19,7 +19,9 @@ from cosim.core.baked import cache_folder
 from cosim.core.errors import MapError, UsageError
 from cosim.place.route_line import through_corner
 from cosim.place.street_map import Port, StreetMap
+from cosim.place.walk_graph import WalkGraph
 from cosim.spec.scenario import City, CityMap
+from scenarios.builders.capacity import capacity_of
 from scenarios.catalog import load_suite
 from sumo_nets.city.store import build_city
 from sumo_nets.maps import importer, netsteps, osmcrop
@@ -97,7 +99,8 @@ def test_osm_becomes_a_place_that_can_be_walked(tmp_path: Path) -> None:
     street_map, check, again = checked_map("kleine-stadt")
     assert again == about and about.source == "Kleine Stadt.osm" and about.guessed_share == 0.0
     assert street_map.name == "kleine-stadt" and street_map.net_hash == about.net_hash
-    assert check.usable and check.unit_possible and check.long_horizon_possible
+    capacity = capacity_of(street_map, WalkGraph(street_map))
+    assert check.usable and capacity.routes.found and all(count.found for count in capacity.structures.values())
     assert check.islands[0].share > 0.99 and check.crossings >= 16 and check.corners >= 16
     assert "OpenStreetMap contributors" in about.licences[0]
     assert any("on the right" in change for change in about.changes)
@@ -561,7 +564,7 @@ def test_command_line(tmp_path: Path, cosim: Cosim) -> None:
     """import and check, their output and exit codes."""
     source, picture = written(tmp_path / "town.osm", osm()), tmp_path / "town.png"
     done = cosim("map", "import", str(source), "--name", "town")
-    assert done.returncode == 0 and "long-horizon scenarios possible" in done.stdout, done.stderr
+    assert done.returncode == 0 and "long route" in done.stdout, done.stderr
     assert "converting " in done.stderr and "checking town ..." in done.stderr
     done = cosim("map", "check", "town", "--json", "-o", str(picture), "--zoom", "0,0,100,100")
     assert done.returncode == 0 and json.loads(done.stdout)["check"]["corners"] > 10
@@ -657,12 +660,14 @@ def test_shared_maps_import(request: pytest.FixtureRequest, name: str) -> None:
     raw = MAPS / name / stats["meta"]["raw"]
     source = raw if raw.exists() else MAPS / name / stats["meta"]["net"]
     about = import_map(source, name)
-    _, check, _ = checked_map(name)
+    street_map, check, _ = checked_map(name)
     measured_km = stats[stats["meta"]["net"]]["stat"]["walkable_km"]
     assert check.facts is not None and check.facts.walkable_km == pytest.approx(measured_km, rel=0.05)
     assert check.walkable_km == pytest.approx(measured_km, rel=0.05)
-    assert check.usable and check.long_horizon_possible and about.licences
+    assert check.usable and about.licences
     assert not check.facts.never_green
+    if request.config.getoption("--whole"):
+        assert capacity_of(street_map, WalkGraph(street_map)).routes.found
 
 
 @pytest.mark.engine

@@ -22,6 +22,7 @@ from cosim.core.errors import SOME_CRASHED, WRONG_USE, MapError, UsageError
 if TYPE_CHECKING:
     from cosim.place.map_check import MapCheck
     from cosim.place.street_map import StreetMap
+    from scenarios.builders.capacity import Capacity, FitCount
     from sumo_nets.maps.mapstore import About
 
 _OUTDATED = (
@@ -63,10 +64,11 @@ def import_(
     with doing(f"reading {file.name}") as tell:
         about = import_map(file, name, options, tell)
         tell(f"checking {about.name}")
-        _, check, about = checked_map(about.name)
-    print_check(check, about)
+        street_map, check, about = checked_map(about.name)
+        capacity = _capacity(street_map, check)
+    print_check(check, about, capacity)
     out.print(f"Kept as '{about.name}': see it with `cosim map check {about.name} -o map.png`.", soft_wrap=True)
-    if not check.usable:
+    if _refusals(check, capacity):
         raise typer.Exit(WRONG_USE)
 
 
@@ -90,6 +92,7 @@ def report_map_check(
     instead = replaced(picture)
     with doing(f"checking {place}") as tell:
         street_map, found, about = _look_up(place)
+        capacity = _capacity(street_map, found)
         if picture is not None:
             from cosim.report.mapsheet import draw_map, write_png
 
@@ -98,13 +101,13 @@ def report_map_check(
             tell("drawing")
             write_png(draw_map(street_map, found, part), picture)
     if as_json:
-        report = {"usable": found.usable, "check": found, "about": about}
+        report = {"usable": not _refusals(found, capacity), "check": found, "capacity": capacity, "about": about}
         typer.echo(msgspec.json.format(msgspec.json.encode(report), indent=2).decode())
     else:
-        print_check(found, about)
+        print_check(found, about, capacity)
         if picture is not None:
             out.print(f"Picture: {picture}{instead}", soft_wrap=True)
-    if not found.usable:
+    if _refusals(found, capacity):
         raise typer.Exit(WRONG_USE)
 
 
@@ -148,8 +151,8 @@ def list_() -> None:
     print_fitted(out, table, words=[1, 2])
 
 
-def print_check(check: MapCheck, about: About | None) -> None:
-    """A check in words."""
+def print_check(check: MapCheck, about: About | None, capacity: Capacity | None) -> None:
+    """Print a check in words, and how many places each kind of scenario has."""
     from sumo_nets.maps.mapstore import outdated
 
     width_m, height_m = check.size_m
@@ -158,15 +161,19 @@ def print_check(check: MapCheck, about: About | None) -> None:
         table.add_row(what, value)
     table.add_row("size", f"{width_m:.0f} x {height_m:.0f} m, traffic on the {'left' if check.left_hand else 'right'}")
     print_fitted(out, table, words=[1])
-    said = [("note", note) for note in check.notes]
+    if capacity is not None:
+        shown = Table("scenarios", "places where they fit, of those on the largest island", box=box.SIMPLE_HEAD)
+        for name, count in _by_name(capacity):
+            shown.add_row(name, str(count))
+        print_fitted(out, shown, words=[1])
+    said = [("warning", warning) for warning in check.warnings] + [("note", note) for note in check.notes]
     if about is not None:
         said += [("note", _OUTDATED)] if outdated(about) else []
         said += [("changed", change) for change in about.changes]
         said += [("licence", licence) for licence in about.licences or ("none found: ask where the file comes from",)]
-    said += [("NOT USABLE", reason) for reason in check.reasons]
+    said += [("NOT USABLE", reason) for reason in _refusals(check, capacity)]
     for head, words in said:
         out.print(f"{head}: {words}", soft_wrap=True, markup=False, highlight=False)
-    out.print(f"unit scenarios {_yes(check.unit_possible)}, long-horizon scenarios {_yes(check.long_horizon_possible)}")
 
 
 def _rows(check: MapCheck) -> list[tuple[str, str]]:
@@ -187,6 +194,7 @@ def _rows(check: MapCheck) -> list[tuple[str, str]]:
             "on the road",
             f"{check.overlap_share:.1%} of the sidewalks' area; {check.on_road} lie mostly on it; routes avoid them",
         ),
+        ("driven over", f"{check.driven_over} corners, where cars turn, crossings apart; routes avoid them"),
         ("over or under a road", f"{check.stacked} sidewalks, with no crossing there"),
         ("guessed sidewalks", guessed),
         ("shown by the map", shown or "no buildings, no things: all are made up"),
@@ -215,5 +223,24 @@ def _look_up(called: str) -> tuple[StreetMap, MapCheck, About | None]:
     return street_map, check_map(street_map, None, read_facts(path)), None
 
 
-def _yes(possible: bool) -> str:
-    return "possible" if possible else "NOT possible"
+def _capacity(street_map: StreetMap, check: MapCheck) -> Capacity | None:
+    """What fits on a map; None where nothing can."""
+    from cosim.place.walk_graph import walk_graph_of
+    from scenarios.builders.capacity import capacity_of
+
+    return capacity_of(street_map, walk_graph_of(street_map)) if check.usable else None
+
+
+def _by_name(capacity: Capacity) -> list[tuple[str, FitCount]]:
+    return [
+        *((f"event {name}", count) for name, count in capacity.events.items()),
+        *((f"unit {name}", count) for name, count in capacity.structures.items()),
+        ("long route", capacity.routes),
+    ]
+
+
+def _refusals(check: MapCheck, capacity: Capacity | None) -> list[str]:
+    """Why a map cannot be used; nothing where it can."""
+    if capacity is None or capacity.usable:
+        return list(check.reasons)
+    return ["no event, no unit scenario and no long route fits: import a larger area, or one with longer sidewalks"]
