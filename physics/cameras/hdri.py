@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 
 from cosim.core.errors import SpecError
 from cosim.core.geometry import Floats
+from cosim.core.whole_file import read_within
 from physics.cameras.clearsky import LUMINANCE
 
 _Image = NDArray[np.float32]
 
 ROWS_MAX = 512
 """Larger pictures are averaged down: a sky is seen blurred."""
+_MOST_BYTES = 1 << 30
 _SPOT_RAD = math.radians(4.0)
 
 
@@ -25,7 +27,10 @@ def read_hdri(path: str) -> _Image:
     file = Path(path)
     if not file.is_file():
         raise SpecError(f"hdri '{path}' does not exist")
-    data = np.frombuffer(file.read_bytes(), np.uint8)
+    try:
+        data = np.frombuffer(read_within(file, _MOST_BYTES), np.uint8)
+    except (OSError, ValueError) as error:
+        raise SpecError(f"hdri '{path}' cannot be read: {getattr(error, 'strerror', error)}") from error
     if data[:2].tobytes() != b"#?":
         raise SpecError(f"hdri '{path}' is no Radiance picture: it does not begin with '#?'")
     try:

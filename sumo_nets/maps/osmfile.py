@@ -18,7 +18,7 @@ import numpy as np
 from cosim.core.errors import MapError
 from sumo_nets.maps.levels import is_levelled
 from sumo_nets.maps.osmcrop import Box, crop_osm
-from sumo_nets.maps.rawfile import BLANK, LARGEST_BYTES, head_of, parse, pour, root_of
+from sumo_nets.maps.rawfile import BLANK, LARGEST_BYTES, head_of, other_root, parse, pour, root_of
 
 READABLE = "SUMO nets (.net.xml, .net.xml.gz) and OpenStreetMap (.osm, .osm.gz, .osm.bz2, .osm.pbf) can be read"
 ON_FOOT = frozenset(("footway", "path", "pedestrian", "steps", "living_street", "track", "cycleway", "bridleway"))
@@ -98,7 +98,9 @@ def _packing(source: Path, head: bytes) -> str:
     if head.lstrip(BLANK)[:1] == b"<":
         return ""
     known = {b"PK": "a zip archive", b"\xfd7zXZ": "an xz file", b"7z\xbc\xaf": "a 7z archive", b"(\xb5/\xfd": "zstd"}
-    found = next((what for magic, what in known.items() if head.startswith(magic)), f"bytes {head[:8]!r}")
+    # Of what it holds nothing is repeated: a scenario's place.file may name any file of the user's.
+    plain = "text" if head.isascii() and b"\0" not in head else "data of no known kind"
+    found = next((what for magic, what in known.items() if head.startswith(magic)), plain)
     raise MapError(f"{source}: neither XML nor a known compression: found {found}; unpack it first; {READABLE}")
 
 
@@ -124,7 +126,7 @@ def _kind(source: Path, plain: Path) -> Format:
         raise MapError(f"{source}: broken XML: {error}") from error
     if tag in ("net", "osm"):
         return "net" if tag == "net" else "osm"
-    raise MapError(f"{source}: not a map: its root element is <{tag}>, not <net> or <osm>; {READABLE}")
+    raise MapError(f"{source}: not a map: {other_root(tag)}, not <net> or <osm>; {READABLE}")
 
 
 @dataclass(slots=True)

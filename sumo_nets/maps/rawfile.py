@@ -29,6 +29,8 @@ DEEPEST = 40
 LONGEST_BYTES = 16 * 1024**2
 """Of a single tag or comment."""
 PIECE_BYTES = 1 << 20
+KNOWN_ROOTS = ("additional", "gpx", "html", "kml", "osmChange", "routes", "svg", "tlLogics")
+"""What else is taken for a map. Other names are not repeated: a file that is no map may be any file of the user's."""
 BLANK = b"\xef\xbb\xbf\xff\xfe\x00 \t\r\n"
 """What may stand before the first element, marks of byte order included."""
 
@@ -87,7 +89,7 @@ def _bounded(source: Path, stream: IO[bytes], packed: int) -> Iterator[bytes]:
     size = 0
     while piece := stream.read(PIECE_BYTES):
         if not size and not piece.lstrip(BLANK).startswith(b"<"):
-            raise MapError(f"{source}: it holds no XML: it begins with {piece[:8]!r}")
+            raise MapError(f"{source}: it holds no XML")
         size += len(piece)
         if size > LARGEST_BYTES:
             gib = LARGEST_BYTES >> 30
@@ -113,7 +115,14 @@ def parse(parser: expat.XMLParserType, path: Path) -> None:
     except KeyError as error:
         raise ValueError(f"attribute {error} is missing: line {parser.CurrentLineNumber}") from error
     except (LookupError, ValueError) as error:
+        if "encoding" in str(error):
+            raise ValueError("unknown encoding: line 1") from error
         raise ValueError(f"{error}: line {parser.CurrentLineNumber}") from error
+
+
+def other_root(tag: str) -> str:
+    """In words, the root element of a file of XML that is no map."""
+    return f"its root element is <{tag}>" if tag in KNOWN_ROOTS else "its root element is another"
 
 
 def root_of(path: Path) -> str:
@@ -134,8 +143,8 @@ def root_of(path: Path) -> str:
         nonlocal depth
         depth -= 1
 
-    def entity(name: str, *_rest: object) -> None:
-        raise ValueError(f"it declares an entity, '{name}': no map has any")
+    def entity(*_declared: object) -> None:
+        raise ValueError("it declares an entity: no map has any")
 
     parser.ordered_attributes = True
     parser.StartElementHandler, parser.EndElementHandler, parser.EntityDeclHandler = start, end, entity

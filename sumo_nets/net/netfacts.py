@@ -16,7 +16,7 @@ import shapely
 from cosim.core.errors import MapError
 from cosim.place.map_check import STEEP, NetFacts
 from cosim.place.terrain import FALSE_GRADE
-from sumo_nets.maps.rawfile import net_bytes
+from sumo_nets.maps.rawfile import net_bytes, other_root
 from sumo_nets.net.netfile import going_on
 
 GO = frozenset("Gg")
@@ -41,7 +41,7 @@ def net_root(path: Path) -> ET.Element:
     except (ET.ParseError, LookupError, ValueError) as error:
         raise MapError(f"{path}: broken XML: {error}") from error
     if root.tag != "net":
-        raise MapError(f"{path}: not a SUMO street net: its root element is <{root.tag}>")
+        raise MapError(f"{path}: not a SUMO street net: {other_root(root.tag)}, not <net>")
     return root
 
 
