@@ -6,12 +6,13 @@ JOBS ?= 2
 BIN := .venv/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: help run test check bench lock clean machine
+.PHONY: help run test check docs bench lock clean machine
 
 help:
 	@echo "make run    run two long-horizon episodes and print their table"
 	@echo "make test   run every test, the fast ones first"
 	@echo "make check  ruff, mypy, import-linter"
+	@echo "make docs   the documentation as a site in build/docs, every warning an error"
 	@echo "make bench  speed and memory, with ratios"
 	@echo "make lock   write the lock files anew after a change of pyproject.toml"
 	@echo "make clean  remove the virtual environment and caches"
@@ -28,6 +29,11 @@ check: .venv/dev.stamp | machine
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/lint-imports --no-logo
+
+# Links to other sites are not fetched.
+docs: .venv/docs.stamp | machine
+	@$(BIN)/python -m sphinx -b html -W --keep-going -n -q -d build/doctrees docs build/docs
+	@echo "The documentation is in build/docs/index.html"
 
 bench: .venv/run.stamp | machine
 	@$(BIN)/cosim bench
@@ -51,6 +57,10 @@ machine:
 	$(call install,requirements-dev.lock)
 	@touch .venv/run.stamp $@
 
+.venv/docs.stamp: .venv/pip.stamp requirements-docs.lock pyproject.toml | machine
+	$(call install,requirements-docs.lock)
+	@touch $@
+
 # Python compiles a module when it is first imported: doing all of them here would double the time of the set-up.
 define install
 @echo "Set-up, 2 of 3: the packages of $(1), each held against its hash"
@@ -67,7 +77,8 @@ lock: | machine
 	@set -e; lock() { $(UV) --custom-compile-command "make lock" --python-version 3.11 \
 	  --python-platform x86_64-manylinux_2_28 pyproject.toml --group build "$$@"; }; \
 	lock --output-file requirements.lock; \
-	lock --output-file requirements-dev.lock --extra dev --constraint requirements.lock
+	lock --output-file requirements-dev.lock --extra dev --constraint requirements.lock; \
+	lock --output-file requirements-docs.lock --extra docs --constraint requirements-dev.lock
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

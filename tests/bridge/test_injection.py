@@ -30,6 +30,7 @@ from scenarios.execution import injected
 from scenarios.execution.injected import MOST_INJECTED, InjectedPeople, RobotOnRoute
 from tests.bridge.security.plain import free_port
 from tests.conftest import PATIENCE_S, Cosim
+from tests.documents import blocks
 
 TICK_MS = 50
 
@@ -439,13 +440,11 @@ def test_a_pedestrian_injected_from_another_process_is_in_the_record_and_replays
 
 @pytest.mark.engine
 def test_plain_zenoh_scripts_step_in_listen_and_can_do_no_harm(tmp_path: Path, cosim: Cosim) -> None:
-    """The README's script injects, one who comes late hears all topics and gets the log, nonsense and floods bounce."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    found = re.search(r"```python\n(import json, zenoh\n.*?)```", readme, re.DOTALL)
-    assert found is not None
+    """The script of docs/viewing.md injects, a late listener gets all topics and the log, and floods bounce."""
+    (script,) = blocks("python", "docs/viewing.md")
     with on_air(tmp_path, f"unixsock-stream/{tmp_path}/air.sock") as air:
-        script = found[1].replace("tcp/127.0.0.1:7447", air.at)
-        (tmp_path / "ten.py").write_text(script)
+        text = script.text.replace("tcp/127.0.0.1:7447", air.at)
+        (tmp_path / "ten.py").write_text(text)
         assert cosim("listen", "--connect", air.at, "--wait", str(PATIENCE_S), "--seconds", "0").returncode == 0
         bob = json.loads(air.python("ten.py").stdout)
         words = [sys.executable, "-c", CONNECTED + LISTENER, air.at]

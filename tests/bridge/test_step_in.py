@@ -1,4 +1,4 @@
-"""The ways to step into a live run as the README, `--help` and the run itself print them, on the first scenario."""
+"""The ways to step into a live run as docs/viewing.md, `--help` and the run itself print them, on one scenario."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ import pytest
 from cosim.cli.options.endpoint import reached_by
 from cosim.spec.connection import Connection
 from tests.bridge.security.plain import free_port
-from tests.conftest import PATIENCE_S, ROOT, Cosim
+from tests.conftest import PATIENCE_S, Cosim
+from tests.documents import text_of
 
-README = re.search(r"\n## Step in\n(.*?)\n## ", (ROOT / "README.md").read_text(), re.DOTALL)
+SECTION = re.search(r"\n## Live injection\n(.*?)\n## ", text_of("docs/viewing.md"), re.DOTALL)
 WRITTEN = "tcp/127.0.0.1:7447"
 """The address of the examples, in whose place the test has a free one."""
 
@@ -29,14 +30,14 @@ def examples_in(text: str, name: str, at: str) -> list[list[str]]:
 
 
 @pytest.mark.engine
-def test_the_examples_of_readme_and_help_step_into_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
-    """Run, inject, listen and the Python script of the README, the examples of `cosim inject --help`, and the command
+def test_the_examples_of_documents_and_help_step_into_the_first_scenario(tmp_path: Path, cosim: Cosim) -> None:
+    """Run, inject, listen and the Python script of the page, the examples of `cosim inject --help`, and the command
     that the run prints: each is accepted as written, but for the address."""
-    assert README is not None
-    at, (script,) = f"tcp/127.0.0.1:{free_port()}", re.findall(r"```python\n(.*?)```", README[1], re.DOTALL)
+    assert SECTION is not None
+    at, (script,) = f"tcp/127.0.0.1:{free_port()}", re.findall(r"```python\n(.*?)```", SECTION[1], re.DOTALL)
     (tmp_path / "bob.py").write_text(script.replace(WRITTEN, at))
     (tmp_path / "pedestrian.json").write_text('{"id": "emil", "path": [{"ahead": 8}]}')
-    (run,) = (words for words in examples_in(README[1], "run", at) if "--live" in words)
+    (run,) = (words for words in examples_in(SECTION[1], "run", at) if "--live" in words)
     accepted, said = [], ""
     with subprocess.Popen(
         [sys.executable, "-m", "cosim", *run], cwd=tmp_path, stderr=subprocess.PIPE, text=True
@@ -48,7 +49,7 @@ def test_the_examples_of_readme_and_help_step_into_the_first_scenario(tmp_path: 
                 assert line, said
             waits = cosim("listen", "events", "--connect", at, "--wait", str(PATIENCE_S), "--seconds", "0")
             assert waits.returncode == 0, waits.stderr
-            texts = README[1], cosim("inject", "--help").stdout, said
+            texts = SECTION[1], cosim("inject", "--help").stdout, said
             examples = [words for text in texts for words in examples_in(text, "inject", at)]
             assert len(examples) >= 5
             for example in examples:
@@ -59,7 +60,7 @@ def test_the_examples_of_readme_and_help_step_into_the_first_scenario(tmp_path: 
                 [sys.executable, "bob.py"], cwd=tmp_path, capture_output=True, text=True, timeout=PATIENCE_S
             )
             assert json.loads(python.stdout)["status"] == "accepted", python
-            (listen,) = examples_in(README[1], "listen", at)
+            (listen,) = examples_in(SECTION[1], "listen", at)
             with subprocess.Popen(
                 [sys.executable, "-m", "cosim", *listen], stdout=subprocess.PIPE, text=True
             ) as listening:

@@ -13,6 +13,7 @@ from cosim.cli.app import main
 from cosim.core import errors
 from cosim.core.errors import CosimError
 from tests.conftest import Cosim
+from tests.documents import text_of
 
 CODES = {
     "UsageError": 2, "SpecError": 2, "MapError": 2, "RunError": 2, "AccessError": 2, "PolicyError": 1, "EngineError": 3,
@@ -97,9 +98,9 @@ def test_a_run_with_fewer_records_than_scenarios_is_no_success(
     assert "No record of obstructing-001, conversing-001: run it again with --resume" in capsys.readouterr().err
 
 
-def test_the_readme_tells_the_exit_codes() -> None:
-    """The table of the README names every code of the module."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
+def test_the_documents_list_the_exit_codes() -> None:
+    """The table of docs/first-run.md names every code of the module."""
+    page = text_of("docs/first-run.md")
     for code in (
         errors.ALL_SCORED,
         errors.SOME_CRASHED,
@@ -108,12 +109,11 @@ def test_the_readme_tells_the_exit_codes() -> None:
         errors.INTERRUPTED,
         errors.UNREAD,
     ):
-        assert f"\n| {code} |" in readme
+        assert f"\n| {code} |" in page
 
 
 def test_the_help_tells_the_exit_codes(cosim: Cosim) -> None:
-    """`cosim --help` names every code of the README's table."""
-    readme = (Path(__file__).parents[2] / "README.md").read_text()
-    codes = [line.split("|")[1].strip() for line in readme.splitlines() if re.match(r"\| \d+ \|", line)]
+    """`cosim --help` names every code of the table in docs/first-run.md."""
+    codes = re.findall(r"^\| (\d+) \|", text_of("docs/first-run.md"), re.MULTILINE)
     told = " ".join(cosim("--help").stdout.split()).partition("Exit codes: ")[2]
     assert len(codes) == 6 and re.findall(r"(?:^|; )(\d+) ", told) == codes

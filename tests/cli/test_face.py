@@ -5,7 +5,6 @@ from __future__ import annotations
 import doctest
 import io
 import re
-import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 import cosim
 
 ROOT = Path(__file__).parents[2]
-EXAMPLES = Path(__file__).parents[1] / "examples"
 DRIVES = ("Episode", "make_env", "run")
 """Public names whose example drives a robot."""
 PRODUCT = ("cosim", "sumo_nets", "physics", "bridge", "scenarios")
@@ -52,24 +50,6 @@ def test_another_name_is_refused_with_the_valid_ones() -> None:
     """A misspelt name is an AttributeError that lists what there is."""
     with pytest.raises(AttributeError, match=r"no attribute 'Epsiode'.*Episode"):
         cosim.Epsiode  # noqa: B018  the access is the test
-
-
-def test_the_readme_shows_the_examples_as_they_are() -> None:
-    """Each script in `tests/examples` stands in the README, word for word."""
-    readme = (ROOT / "README.md").read_text()
-    for path in sorted(EXAMPLES.glob("*.py")):
-        assert f"```python\n{path.read_text()}```" in readme, path.name
-
-
-@pytest.mark.engine
-@pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.py")), ids=lambda path: path.stem)
-def test_the_examples_run_as_written(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """A script of the README ends well and prints what it promises."""
-    monkeypatch.chdir(tmp_path)
-    runpy.run_path(str(path), run_name="__main__")
-    assert "obstructing-001" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("engine", ["SumoCrowd(", "BulletWorld("])

@@ -22,7 +22,7 @@ def locked(name: str) -> dict[str, str]:
     return dict(re.findall(r"^([a-z0-9-]+)==(\S+)", (ROOT / name).read_text(), re.MULTILINE))
 
 
-@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock"], ids=["run", "dev"])
+@pytest.mark.parametrize("name", ["requirements.lock", "requirements-dev.lock", "requirements-docs.lock"])
 def test_every_locked_package_has_hashes_and_no_home(name: str) -> None:
     """A lock file names packages, versions and hashes alone: no host, no folder, no version of somebody's own."""
     text = re.sub(r"^#.*\n", "", (ROOT / name).read_text(), flags=re.MULTILINE)
@@ -31,16 +31,19 @@ def test_every_locked_package_has_hashes_and_no_home(name: str) -> None:
 
 
 def test_the_lock_files_hold_what_the_project_asks_for() -> None:
-    """Every requirement is locked within its range, what builds the project too; tests and runs agree."""
+    """Every requirement is locked within its range, what builds the project too; tests, site and runs agree."""
     run, dev = locked("requirements.lock"), locked("requirements-dev.lock")
-    assert run.items() <= dev.items()
+    site = locked("requirements-docs.lock")
+    assert run.items() <= dev.items() and run.items() <= site.items()
+    assert all(dev.get(name, version) == version for name, version in site.items())
     project, groups = PROJECT["project"], PROJECT["dependency-groups"]
     for line in (*project["dependencies"], *groups["build"], *PROJECT["build-system"]["requires"]):
         asked = Requirement(line)
         assert asked.specifier.contains(run[canonicalize_name(asked.name)]), line
-    for line in project["optional-dependencies"]["dev"]:
-        asked = Requirement(line)
-        assert asked.specifier.contains(dev[canonicalize_name(asked.name)]), line
+    for extra, pinned in (("dev", dev), ("docs", site)):
+        for line in project["optional-dependencies"][extra]:
+            asked = Requirement(line)
+            assert asked.specifier.contains(pinned[canonicalize_name(asked.name)]), line
 
 
 def test_what_is_installed_here_is_what_is_locked() -> None:

@@ -108,12 +108,13 @@ def test_a_python_is_asked_what_it_is(script: str, wrong: str, tmp_path: Path) -
     assert Machine().runs(str(tmp_path / "none")) == f"there is no '{tmp_path / 'none'}'"
 
 
-@pytest.mark.parametrize("verb", ["run", "test", "check", "bench"])
+@pytest.mark.parametrize("verb", ["run", "test", "check", "docs", "bench"])
 def test_make_looks_before_it_sets_up(verb: str, tmp_path: Path) -> None:
     """Every verb of make that needs the packages first checks the machine: one error, and nothing is begun."""
     make = shutil.which("make")
     assert make is not None
-    for name in ("Makefile", "pyproject.toml", "requirements.lock", "requirements-dev.lock", "cosim/machine.py"):
+    locks = (path.name for path in ROOT.glob("requirements*.lock"))
+    for name in ("Makefile", "pyproject.toml", *locks, "cosim/machine.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
     python = tmp_path / "python3.12"

@@ -1,4 +1,4 @@
-"""The README's table of all that an observation holds, against observations of real episodes."""
+"""The table in docs/observations.md of all that an observation holds, against observations of real episodes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cosim.spec.scenario import CrowdSpec
 from scenarios.checks import small_scenario
 from scenarios.execution.episode import Episode
 from scenarios.serving.observed import GOAL, arrays_of, seen_from_afar, told_about, told_goal
-from tests.conftest import ROOT
+from tests.documents import text_of
 
 SPEC = CameraSpec(32, 24, depth=True, labels=True)
 ALL = Manifest(
@@ -47,8 +47,8 @@ class Row(NamedTuple):
 
 
 def table() -> list[Row]:
-    """The README's table, a row for each attribute."""
-    lines = (ROOT / "README.md").read_text().partition("| of `observation` |")[2].partition("\n\n")[0].splitlines()[2:]
+    """The table of the page, a row for each attribute."""
+    lines = text_of("docs/observations.md").partition("| of `observation` |")[2].partition("\n\n")[0].splitlines()[2:]
     found = []
     for line in lines:
         named, asked, types, words = (cell.strip() for cell in line.strip("|").split(" | "))
@@ -152,10 +152,10 @@ def test_who_asks_for_nothing_gets_none() -> None:
 
 @pytest.mark.engine
 def test_the_table_holds_where_policies_are_hosted_elsewhere(seen: dict[str, Observation]) -> None:
-    """Isolated and served policies get the same types; one without cosim the same names, but for those that the README
+    """Isolated and served policies get the same types; one without cosim the same names, but for those that the page
     lists, and the same arrays of goals and odometry."""
-    readme = " ".join((ROOT / "README.md").read_text().split())
-    lacking = set(re.findall(r"`([\w.]+)`", readme.partition("but of these: ")[2].partition("Points, noise")[0]))
+    listed = text_of("docs/observations.md").partition("It lacks these attributes: ")[2].partition("\n\n")[0]
+    lacking = set(re.findall(r"`([\w.]+)`", listed))
     assert len(lacking) == 6
     for protocol, one in seen.items():
         afar, plain = hosted(one)

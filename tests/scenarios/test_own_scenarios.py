@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from scenarios.own.format import OwnEvent, OwnScenario, OwnWay
 from scenarios.own.reading import read_own
 from scenarios.own.ways import laid_way
 from tests.conftest import ROOT, Cosim
+from tests.documents import blocks
 from tests.tiny_street import tiny_map
 
 CITY = "[place]\ncity = 1\nsize_m = 500\n"
@@ -160,10 +160,9 @@ def test_the_template_shows_every_field_there_is() -> None:
     assert fields(OwnScenario) - shown == {"shadows", "hdri", "paint"}
 
 
-def test_the_file_in_the_readme_can_be_read(tmp_path: Path) -> None:
+def test_the_file_in_the_documents_can_be_read(tmp_path: Path) -> None:
     """What it shows is a sweep over density, on a map's file beside it."""
-    (shown,) = re.findall(r"```toml\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
-    own = read_own(written(tmp_path, shown))
+    own = read_own(written(tmp_path, blocks("toml", "docs/scenarios.md")[0].text))
     assert [axis.field for axis in own.axes] == ["crowd.density"]
     assert Path(own.variants[0].own.place.file).parent == tmp_path
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ast
-import re
 import shutil
 import socket
 import subprocess
@@ -31,6 +30,7 @@ from scenarios.checks import small_scenario
 from scenarios.execution import suite_run
 from scenarios.serving.remote import RemoteDriver, remote_driver
 from tests.conftest import PATIENCE_S, ROOT, Cosim, seed_in_order
+from tests.documents import blocks
 from tests.scenarios.isolated_policies import Honest
 
 SERVER = ROOT / "bridge" / "policy_server.py"
@@ -39,9 +39,9 @@ NEEDS = ("eclipse-zenoh>=1.10,<2", "msgspec", "numpy")
 
 
 def example() -> str:
-    """The complete example of the README."""
-    (block,) = re.findall(r"```python\n(from policy_server import serve.*?)```", (ROOT / "README.md").read_text(), re.S)
-    return str(block)
+    """The complete example of docs/hosting.md."""
+    (block,) = blocks("python", "docs/hosting.md")
+    return block.text
 
 
 def free_endpoint() -> str:

@@ -32,6 +32,7 @@ from cosim.spec.scenario import CityMap, Suite
 from scenarios.catalog import SUITES, load_suite
 from scenarios.events.table import EVENT_KINDS
 from scenarios.viewing.eventsheet import COLUMNS
+from tests.documents import text_of
 from tests.records.driven_runs import episode_of, short_way
 
 
@@ -90,16 +91,16 @@ def test_a_letter_means_one_thing_in_every_table() -> None:
 
 
 def test_every_letter_and_heading_is_explained_under_its_table() -> None:
-    """Letters have their meaning in the line below, rates their unit in the heading, and the README has the same."""
+    """Letters have their meaning in the line below, rates their unit in the heading, as the documents do."""
     table, kinds = pair_of_kinds()
     out, said = terminal()
     print_table(out, table, 2)
     text = " ".join(said.getvalue().split())
-    readme = " ".join((Path(__file__).parents[3] / "README.md").read_text().split())
+    page = " ".join(text_of("docs/baselines.md").split())
     for _, letter in SHOWN:
         assert f"{letter} {LETTERS[letter]}" in text, letter
     for letter in ("C", "OL", "F"):
-        assert f"{letter} {LETTERS[letter]}" in readme.replace("`", ""), letter
+        assert f"{letter} {LETTERS[letter]}" in page.replace("`", ""), letter
     assert text.count("/100m") >= 4 and "m/s" in text
     out, said = terminal()
     print_by_kind(out, table, kinds)

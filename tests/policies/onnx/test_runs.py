@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import msgspec
@@ -20,6 +19,7 @@ from cosim.spec.scenario import Scenario, Suite, write_suite
 from scenarios.checks import small_scenario
 from scenarios.execution.run import run_episode
 from tests.conftest import Cosim
+from tests.documents import blocks, shell_lines
 from tests.policies.onnx.graphs import bundle, graph_bytes, port, tiny_graph
 
 BLIND = tiny_graph(bright=np.zeros((6 * 4 * 8, 1), np.float32))
@@ -71,13 +71,10 @@ def test_a_bundle_drives_alike_in_its_own_process_and_in_several(tmp_path: Path,
 
 
 @pytest.mark.engine
-def test_the_bundle_of_the_readme_runs_as_it_is_written(tmp_path: Path, cosim: Cosim) -> None:
+def test_the_bundle_of_the_documents_runs_as_it_is_written(tmp_path: Path, cosim: Cosim) -> None:
     """Its manifest, and its command on a short suite, with a graph of those inputs and that output."""
-    readme = (Path(__file__).parents[3] / "README.md").read_text()
-    (manifest,) = re.findall(r"```json\n(\{\"format\": 1.*?)```", readme, re.DOTALL)
-    (command,) = re.findall(
-        r"^    \.venv/bin/cosim (run reactive --policy onnx:my_network) +# or", readme, re.MULTILINE
-    )
+    ((_, _, _, manifest),) = blocks("json", "docs/onnx.md")
+    (command,) = (words for _, words in shell_lines("docs/onnx.md") if words[-1] == "onnx:my_network")
     assert len(manifest.splitlines()) < 10
     frames, goal, plan = port("frames", 1, 12, 90, 160), port("goal", 1, 3), port("waypoints", 1, 8, 2)
     nodes = [
@@ -89,7 +86,7 @@ def test_the_bundle_of_the_readme_runs_as_it_is_written(tmp_path: Path, cosim: C
     weights = {"way": np.ones((3, 16), np.float32), "shape": np.array([1, 8, 2])}
     bundle(tmp_path / "my_network", graph_bytes(nodes, [frames, goal], [plan], weights), json.loads(manifest))
     write_suite(Suite(name="reactive", version="1", scenarios=(second("a"),)), tmp_path / "one.json")
-    said = cosim(*command.replace("reactive", "one.json").split(), "--out", "run", cwd=tmp_path)
+    said = cosim(*["one.json" if word == "reactive" else word for word in command[1:]], "--out", "run", cwd=tmp_path)
     (record,) = read_records(tmp_path / "run")
     assert said.returncode == 0 and (record.policy, record.status) == ("my-network", "done"), said.stderr
 
