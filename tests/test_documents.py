@@ -232,3 +232,14 @@ def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
     (paper,) = cited["references"]
     names = " and ".join(f"{author['family-names']}, {author['given-names']}" for author in paper["authors"])
     assert names in text_of("README.md") and paper["title"] in text_of("README.md")
+
+
+def test_the_results_of_the_readme_are_those_of_the_baselines() -> None:
+    """Eight policies; each figure with an interval is in a row of the same policy on the page of all results."""
+    rows = [line.strip("| ").split(" | ") for line in text_of("README.md").splitlines() if "| camera |" in line]
+    page = text_of("docs/baselines.md").splitlines()
+    results = text_of("README.md").partition("## Results")[2].partition("## ")[0]
+    assert len(rows) == 5 and len(re.findall(r"^\| `", results, re.MULTILINE)) == 8
+    for name, _, *figures in rows:
+        tested = [line for line in page if line.startswith((f"| {name} | test |",))]
+        assert all(any(f"| {figure} |" in line for line in tested) for figure in figures), name
