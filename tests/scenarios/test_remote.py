@@ -115,7 +115,7 @@ def pythons(request: pytest.FixtureRequest, folder: Path) -> Iterator[list[str]]
 
 
 @pytest.mark.engine
-def test_the_example_of_the_readme_serves_from_a_clean_environment(
+def test_the_example_of_the_documents_serves_from_a_clean_environment(
     tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     """At most ten lines, run as they are written but for the port, where there is no cosim: asked as any policy. With
