@@ -126,7 +126,8 @@ def widen_sidewalks(
         return net
     work.changes += said
     ready = work.written(root, "widths.net.xml")
-    return work.netconvert("widening sidewalks", "widened.net.xml", ["-s", str(ready)])
+    # Wider sidewalks move corners, and netconvert drops crossings that miss theirs: it guesses these again.
+    return work.netconvert("widening sidewalks", "widened.net.xml", ["-s", str(ready), "--crossings.guess"])
 
 
 def start_sumo(file: MapFile, net: Path) -> None:

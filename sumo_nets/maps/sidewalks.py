@@ -27,6 +27,7 @@ WIDTH_LIMITS_M: Final = 1.0, 10.0
 """Narrowest and widest sidewalk that can be asked for; on less than 1 m a robot and a person cannot pass."""
 _TAGGED_M: Final = 0.5, 20.0
 """Tagged widths outside of this are ignored."""
+_ON_PATHS: Final = frozenset(("pedestrian", "bicycle"))
 _CLASS_OF: Final = {"trunk": "primary"}
 _CLASS = re.compile(r"highway\.([a-z]+)")
 
@@ -71,7 +72,7 @@ def set_widths(
 ) -> list[str]:
     """Set the widths of guessed sidewalks in place. Return what was changed, a sentence, or nothing.
 
-    Walkways without a road keep their widths.
+    Walkways beside no lane for vehicles, or one for bicycles alone, keep their widths.
 
     widths_m: by street class; empty changes nothing.
     tagged: tags of OSM ways that give widths of sidewalks, by the ids of the ways.
@@ -83,7 +84,7 @@ def set_widths(
     guessed_m, tagged_m = defaultdict[str, float](float), 0.0
     for edge in root.iter("edge"):
         lane = pavement(edge)
-        if lane is None or len(edge.findall("lane")) < 2 or edge.get("id") in before:
+        if lane is None or edge.get("id") in before or all(other is lane for other in _driven(edge)):
             continue
         width_m, length_m = _tagged_m(edge, tagged, left_hand), float(lane.get("length", "0"))
         if width_m is None:
@@ -108,8 +109,12 @@ def street_class(edge: ET.Element) -> str:
     for found in _CLASS.finditer(edge.get("type", "")):
         if (known := _CLASS_OF.get(found[1], found[1])) in STREET_WIDTHS_M:
             return known
-    driven = [lane for lane in edge.findall("lane") if lane.get("allow") != "pedestrian"]
-    return "secondary" if "highway." not in edge.get("type", "") and len(driven) > 1 else "residential"
+    return "secondary" if "highway." not in edge.get("type", "") and len(_driven(edge)) > 1 else "residential"
+
+
+def _driven(edge: ET.Element) -> list[ET.Element]:
+    """The lanes of an edge that are not for people and bicycles alone."""
+    return [lane for lane in edge.findall("lane") if set(lane.get("allow", "all").split()) - _ON_PATHS]
 
 
 def _tagged_m(edge: ET.Element, tagged: Mapping[str, Mapping[str, str]], left_hand: bool) -> float | None:
