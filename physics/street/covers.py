@@ -32,10 +32,11 @@ def covers_in(street_map: StreetMap, tile: Tile, rims: bool) -> dict[LandKind, M
     if "ground" not in tile.parts:
         return {}
     ground, found = tile.parts["ground"], {}
-    outline = overlay.union_all(_outlines(ground))
-    for kind, area in open_ground(street_map, shapely.box(*square(tile.key))):
+    areas = open_ground(street_map, shapely.box(*square(tile.key)))
+    outline = overlay.union_all(_outlines(ground)) if areas and rims else None
+    for kind, area in areas:
         mesh = _spread(ground, area)
-        if rims:
+        if outline is not None:
             mesh = _edged(mesh, shapely.boundary(overlay.intersection(area, outline)))
         if len(mesh):
             found[kind] = mesh
