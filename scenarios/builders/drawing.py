@@ -12,15 +12,24 @@ import shapely
 
 from cosim.core.errors import CosimError, SpecError
 from cosim.core.geometry import Polyline
+from cosim.people.yielding import STEP_ROUND_GAP_M
 from cosim.place.street_map import StreetMap, Strip
 from cosim.spec.event_kind import EventKind
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import Place, RouteCrossing, Scenario
+from sumo_nets.crowd.group_sampling import GROUP_STRIPE_M
 
 TRIES: Final = 400
 PERSON_M2: Final = 25.0
 """Sidewalk that every person has at least, on the mean along a route; in generated cities it is about 29 m2."""
 _SAMPLE_M: Final = 20.0
+
+FREE_M2: Final = 20.0
+"""Area of sidewalk for each person, less the lane that a robot needs, on routes drawn by users; in cities about 21."""
+LARGEST_GROUP_M: Final = 3 * GROUP_STRIPE_M
+"""Width of the largest group, side by side."""
+NARROW_M: Final = 10.0
+"""Up to this length of a route, sidewalks without room to pass a group do not count."""
 
 _Drawn = TypeVar("_Drawn")
 
@@ -108,6 +117,32 @@ def wider_m(robot: Robot) -> float:
 
 def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
     """The scenario with no more people than the sidewalks within the crowd's radius of its route have room for."""
+    persons = min(scenario.crowd.persons, round(_area_around_m2(scenario, street_map, 0.0) / PERSON_M2))
+    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons))
+
+
+def passable(scenario: Scenario, street_map: StreetMap, robot: Robot = COURIER) -> Scenario:
+    """The scenario with a crowd that leaves a robot room to pass.
+
+    There are as many people as fit beside the robot, and no groups where three abreast fill a sidewalk of the route.
+    The shipped suites use `thinned` alone.
+    """
+    scenario = thinned(scenario, street_map)
+    lane_m = robot.width_m + 2.0 * STEP_ROUND_GAP_M
+    line = shapely.LineString(scenario.route)
+    narrow_m = sum(
+        strip.polygon.intersection(line).length
+        for strip in street_map.near("strip", line)
+        if isinstance(strip, Strip) and strip.kind == "sidewalk" and strip.width_m < LARGEST_GROUP_M + lane_m
+    )
+    crowd = scenario.crowd
+    persons = min(crowd.persons, round(_area_around_m2(scenario, street_map, lane_m) / FREE_M2))
+    groups = crowd.groups if narrow_m <= NARROW_M else 0.0
+    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(crowd, persons=persons, groups=groups))
+
+
+def _area_around_m2(scenario: Scenario, street_map: StreetMap, less_m: float) -> float:
+    """Mean area of sidewalk within the crowd's radius of points on the route. less_m: taken off each width."""
     route = Polyline(np.array(scenario.route))
     around = [
         shapely.Point(route.at(float(s_m)).xy).buffer(scenario.crowd.radius_m)
@@ -115,11 +150,10 @@ def thinned(scenario: Scenario, street_map: StreetMap) -> Scenario:
     ]
     area_m2 = [
         sum(
-            strip.polygon.intersection(disc).area
+            strip.polygon.intersection(disc).area * max(1.0 - less_m / strip.width_m, 0.0)
             for strip in street_map.near("strip", disc)
             if isinstance(strip, Strip) and strip.kind == "sidewalk"
         )
         for disc in around
     ]
-    persons = min(scenario.crowd.persons, round(float(np.mean(area_m2)) / PERSON_M2))
-    return msgspec.structs.replace(scenario, crowd=msgspec.structs.replace(scenario.crowd, persons=persons))
+    return float(np.mean(area_m2))

@@ -13,7 +13,7 @@ from cosim.spec.event_kind import EventKind, EventKinds
 from cosim.spec.robot import COURIER, Robot
 from cosim.spec.scenario import CityMap, Place, Scenario, Suite
 from scenarios.builders import long_horizon, reactive
-from scenarios.builders.drawing import thinned
+from scenarios.builders.drawing import passable
 from scenarios.events import EVENT_KINDS
 from scenarios.execution.places import place
 from sumo_nets.maps.place_names import place_called
@@ -35,7 +35,7 @@ def suite_on_map(
 
     count: of long-horizon scenarios, 1 by default; of reactive ones, whose events take turns, one of each by default.
     events: which of them; those for which the place has no room are left out, and the description says so, unless they
-    were asked for. Where sidewalks are few or narrow, fewer people walk: on a metre of width nobody passes a robot.
+    were asked for. Where sidewalks are few or narrow, fewer people walk, and none in groups: a robot could not pass.
     roughness: of the ground, from 0 (flat) to 1. kinds: the table of events that there are. robot: which one
     the ways are wide enough for.
 
@@ -54,7 +54,7 @@ def suite_on_map(
     return Suite(
         name=kind,
         version=f"map-{name}-{seed}" + (f"-rough{roughness:g}" if roughness else ""),
-        scenarios=tuple(thinned(scenario, street_map) for scenario in scenarios),
+        scenarios=tuple(passable(scenario, street_map, robot) for scenario in scenarios),
         description=f"Drawn on {name}. {' '.join(left_out)}".strip(),
     )
 

@@ -192,14 +192,14 @@ def test_a_scenario_has_exactly_one_walkable_path(shipped: Scenario) -> None:
         assert strip.polygon.covers(Point(middle[:2])) and strip.signalised == crossing.signalised
 
 
-def cross_map() -> StreetMap:
+def cross_map(width_m: float = 3.2) -> StreetMap:
     """Four sidewalks of 40 m that meet at a corner of 4 m x 4 m in the middle."""
     arms = {"east": (1, 0), "north": (0, 1), "west": (-1, 0), "south": (0, -1)}
     strips = {}
     for name, (dx, dy) in arms.items():
         line = np.array([[2.0 * dx, 2.0 * dy], [42.0 * dx, 42.0 * dy]])
-        polygon = shapely.buffer(LineString(line), 1.6, cap_style="flat")
-        strips[name] = Strip(name, "sidewalk", line, 3.2, polygon, ("middle", None))
+        polygon = shapely.buffer(LineString(line), 0.5 * width_m, cap_style="flat")
+        strips[name] = Strip(name, "sidewalk", line, width_m, polygon, ("middle", None))
     corner = Corner("middle", box(-2, -2, 2, 2), tuple(Port(name, 0) for name in arms))
     return StreetMap("cross", (-42, -42, 42, 42), strips, {"middle": corner}, {}, {})
 
