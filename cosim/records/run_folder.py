@@ -188,7 +188,7 @@ class RunFolder:
             raise unwritable(self.path / _ATTEMPTS, error, _KEPT) from error
         found: Counter[FailedAttempt] = Counter()
         for line in lines:
-            with suppress(msgspec.DecodeError):  # the last line of a machine that failed
+            with suppress(ValueError, RecursionError):  # the last line of a machine that failed
                 found[msgspec.json.decode(line, type=FailedAttempt)] += 1
         return found
 

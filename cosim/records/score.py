@@ -120,10 +120,11 @@ def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Differenc
     told = file.read_bytes().decode(errors="replace")
     if told == follows:
         return
-    mine, theirs = (
-        {row["scenario"]: row for row in csv.DictReader(io.StringIO(text)) if "scenario" in row}
-        for text in (follows, told)
-    )
+    mine = _rows_of(follows)
+    try:
+        theirs = _rows_of(told)
+    except csv.Error:
+        theirs = {}
     if not theirs.keys() <= mine.keys() or not theirs:
         raise RunError(f"{file}: not the table of this run: remove it, and give the command of the run with --resume")
     columns = next(iter(theirs.values()))
@@ -133,6 +134,11 @@ def _cells_that_differ(file: Path, computed: list[Record]) -> Iterator[Differenc
             value = row[column]
             if other.get(column) != value:
                 yield Difference(file.name, name, column, other.get(column) or "nothing", value or "nothing")
+
+
+def _rows_of(table: str) -> dict[str, dict[str, str]]:
+    """The rows of a table, by scenario."""
+    return {row["scenario"]: row for row in csv.DictReader(io.StringIO(table)) if "scenario" in row}
 
 
 def _looked_at(follows: Mapping[str, object], told: Container[str]) -> list[str]:

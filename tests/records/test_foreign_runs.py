@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from cosim.records.run_folder import FailedAttempt, RunFolder, read_spec
 from tests.conftest import Cosim
 from tests.records.driven_runs import run_of
 
@@ -86,3 +87,27 @@ def test_a_run_stopped_before_it_began_is_no_run_to_resume(
     monkeypatch.setattr("scenarios.execution.suite_run.planned_run", interrupted)
     said = cosim("run", "reactive", "--policy", "straight", "--out", "mine", cwd=tmp_path)
     assert said.returncode == 130 and "Stopped before the run began: mine holds nothing" in said.stderr, said
+
+
+def test_a_run_whose_events_never_came_has_no_sheet(tmp_path: Path, cosim: Cosim) -> None:
+    """Also where its scenarios have none: a line in place of a table."""
+    run_of(tmp_path / "run", ["goal"])
+    said = cosim("show", "run", "--events", cwd=tmp_path)
+    assert (said.returncode, said.stdout) == (0, "No event of this run's episodes was triggered.\n"), said
+
+
+def test_a_table_that_is_none_is_refused(tmp_path: Path, cosim: Cosim) -> None:
+    """A results.csv with a cell without end, or with bytes of another kind."""
+    run = run_of(tmp_path / "run", ["goal"])
+    for content in (b"scenario\n" + b"9" * 200_000, b'scenario\n"a\0b\n', b"\xff\xfe"):
+        (run / "results.csv").write_bytes(content)
+        said = cosim("score", "run", cwd=tmp_path)
+        assert said.returncode == 2 and "results.csv: not the table of this run: remove it" in said.stderr, said
+
+
+def test_attempts_that_cannot_be_read_count_for_nothing(tmp_path: Path) -> None:
+    """Bytes that are no text, brackets without end: the other lines count."""
+    run = run_of(tmp_path / "run", ["goal"])
+    (run / "attempts.jsonl").write_bytes(b'\x9f\n["s-000", false]\n' + b"[" * 100_000 + b'\n["s-000"')
+    with RunFolder.resume(run, read_spec(run)) as folder:
+        assert folder.failed_attempts() == {FailedAttempt("s-000", False): 1}

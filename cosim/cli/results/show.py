@@ -118,6 +118,9 @@ def print_sheet(out: Console, sheet: pd.DataFrame) -> None:
     columns."""
     from scenarios.viewing.eventsheet import summary
 
+    if sheet.empty:
+        out.print("No event of this run's episodes was triggered.")
+        return
     heads = ("trigger\nm", "error\nm", "tick\nm", "speed\nm/s", "stated\nm/s", "left\nm", "angle\ndeg", "least\nm")
     columns = (Column(head, justify="right", no_wrap=True) for head in heads)
     rows = Table(Column("episode", overflow="fold"), *columns, box=box.SIMPLE_HEAD, padding=0)
