@@ -1,7 +1,8 @@
 """Training: behaviour cloning in steps, each a function of the seed, the data and the step before.
 
-What it has learned is kept every minute in the folder (`checkpoint.pt`), so that a training that was stopped goes on
-where it was and ends as one in one piece would, on the same device. At its end the bundle is written there.
+What it has learned is kept every minute in the folder (`checkpoint.pt`), so that a training that was stopped continues
+where it was and ends as one in one piece would, on the same device. At its end, and where its time is over, the bundle
+is written there.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -20,83 +21,56 @@ from torch.nn import functional
 
 from cosim.core.errors import RunError, UsageError, unwritable
 from cosim.core.packed import packed_digest
-from cosim.core.whole_file import write_whole
 from cosim.learning.bundle import MODEL, bundle_facts, source_of, write_bundle
+from cosim.learning.curve import write_curve
 from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import parameters_of
 from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, new_parameters, plan, turns_radps
+from cosim.learning.settings import (
+    STEPS,
+    Reached,
+    Training,
+    looks_after,
+    planned_steps,
+    rate_share,
+    refuse_another,
+    state_in_words,
+)
 
 CHECKPOINT: Final = "checkpoint.pt"
-CURVE: Final = "curve.csv"
 _KEPT_EVERY_S: Final = 60.0
-_LOOKS: Final = 20
-"""So often in a training the held-out episodes are looked at, at least so many steps apart: a look takes as long as
-thirty steps or more."""
-_STEPS_APART: Final = 200
+_TIMED_STEPS: Final = (1, 4)
+"""From the first of these steps to the second it is measured how long all of them take."""
 _MOST_HELD_OUT: Final = 4096
 _AVERAGED: Final = 0.999
 """What is shipped are the parameters' moving averages, of so much of the step before."""
-_WARM_UP: Final = 0.03
 _DECAY: Final = 0.01
 _NARROW_RADPS: Final = 0.04
 _WEIGHTS: Final = {"speed": 4.0, "turn": 1.0, "stop": 1.0, "way": 0.5}
 """Of the parts of the loss."""
 
-TellStep = Callable[[int, Mapping[str, float]], None]
-"""Told of a step, and how the held-out episodes fare."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Training:
-    """How it is done. batch: examples a step; rate: of learning, the highest; device: "" for the GPU if there is one.
-    begin: a bundle whose parameters it begins with, None: with new ones. minutes: it stops by itself after so long, to
-    be gone on with. name: of the policy. Raises UsageError."""
-
-    steps: int = 20_000
-    seed: int = 0
-    batch: int = 256
-    rate: float = 1e-3
-    device: str = ""
-    begin: Path | None = None
-    minutes: float = math.inf
-    name: str = "small"
-
-    def __post_init__(self) -> None:
-        for field in ("steps", "batch", "rate", "minutes"):
-            if not getattr(self, field) > 0:
-                raise UsageError(f"--{field} must be above 0, not {getattr(self, field):g}")
-
-    @property
-    def look_every(self) -> int:
-        """So many steps are from one look at the held-out episodes to the next."""
-        return max(self.steps // _LOOKS, _STEPS_APART)
-
-    def looks_after(self, step: int) -> bool:
-        """Whether the held-out episodes are looked at when so many steps are done."""
-        return step % self.look_every == 0 or step == self.steps
-
-    @property
-    def spec(self) -> dict[str, Any]:
-        """What must be the same where a training goes on."""
-        return {name: value for name, value in asdict(self).items() if name in ("steps", "seed", "batch", "rate")}
+TellStep = Callable[[int, int, Mapping[str, float]], None]
+"""Called with the step, with how many there are in all, and with the errors of the held-out episodes, if any."""
 
 
 @dataclass
 class _State:
-    """Where a training stands. averaged: of the parameters; curve: a row for each look at the held-out episodes."""
+    """The state of a training. averaged: of the parameters; curve: a row for each look at the held-out episodes; plans:
+    how many steps were planned in all, at first and whenever that was changed."""
 
     parameters: dict[str, Tensor]
     averaged: dict[str, Tensor]
     optimiser: torch.optim.AdamW
     step: int
     curve: list[dict[str, float]]
+    plans: list[int]
 
 
-def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> bool:
-    """Train on packed demonstrations into a folder; whether it came to its end. resume: go on with what is there, if
-    anything is.
+def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> Reached:
+    """Train on packed demonstrations, and write curve and bundle into a folder, also where time is over before the last
+    step. resume: continue what is there, if anything is; a training that came to its end continues with more steps.
 
-    Raises RunError for data that do not do, for a folder that holds a training that is not to be gone on with, or
+    Raises RunError for data that do not do, for a folder that holds a training that is not to be continued, or
     another one, and where nothing is learned any more; MachineError where the folder cannot be written.
     """
     try:
@@ -105,7 +79,7 @@ def train(paths: Sequence[Path], folder: Path, training: Training, resume: bool,
         raise unwritable(folder, error) from error
 
 
-def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> bool:
+def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool, tell: TellStep) -> Reached:
     device = _device(training.device)
     torch.manual_seed(training.seed)
     torch.backends.cudnn.deterministic = True
@@ -113,37 +87,40 @@ def _train(paths: Sequence[Path], folder: Path, training: Training, resume: bool
     began_s = time.monotonic()
     kept = folder / CHECKPOINT
     if kept.exists() and not resume:
-        raise RunError(f"{folder}: holds a training: go on with it by --resume, or choose another folder")
+        raise RunError(f"{folder}: holds a training: continue it by --resume, or choose another folder")
     begin = None if training.begin is None or kept.exists() else parameters_of(training.begin / MODEL)
     begun = None if training.begin is None else bundle_facts(training.begin)
     examples = Examples(paths, training.seed, device)
     folder.mkdir(parents=True, exist_ok=True)
     spec = training.spec | {"data": ", ".join(map(packed_digest, paths)), "from": begun and begun.digest}
     state = _read(kept, training, spec, device) if kept.exists() else _begun(training, begin, device)
-    saved_s = time.monotonic()
-    while state.step < training.steps:
-        lost = _stepped(state, examples, training)
+    steps, first, saved_s, over = state.plans[-1], state.step, time.monotonic(), False
+    while state.step < steps and not over:
+        lost = _stepped(state, examples, training, steps)
         state.step += 1
-        if training.looks_after(state.step):
-            row = {"step": float(state.step), **lost, **_errors(state.averaged, examples)}
+        over = time.monotonic() - began_s > 60.0 * training.minutes
+        planned = looks_after(state.step, steps)
+        if planned or over:
+            parts = {f"{name}_loss": float(part) for name, part in lost.items()}
+            row = {"step": float(state.step), **parts, **_errors(state.averaged, examples)}
             if not math.isfinite(sum(row.values())):
                 raise RunError(
                     f"{folder}: nothing is learned any more at step {state.step}: train anew, at a lower --rate"
                 )
-            state.curve.append(row)
-            _write_curve(folder, state.curve)
-            tell(state.step, row)
-        if time.monotonic() - began_s > 60.0 * training.minutes:
-            break
-        if time.monotonic() - saved_s > _KEPT_EVERY_S:
+            write_curve(folder, [*state.curve, row])
+            if planned:  # a look because time is over is in the file alone: continued, the curve is that of one piece
+                state.curve.append(row)
+            tell(state.step, steps, row)
+        if not over and time.monotonic() - saved_s > _KEPT_EVERY_S:
             _write(kept, state, spec)
             saved_s = time.monotonic()
-            tell(state.step, {})
+            tell(state.step, steps, {})
+        elif state.step - first in _TIMED_STEPS:
+            tell(state.step, steps, {})
     _write(kept, state, spec)
-    if whole := state.step == training.steps:
-        source = source_of(examples.meta, training.seed, begun)
-        write_bundle(folder, state.averaged, examples, training.name, source)
-    return whole
+    source = source_of(examples.meta, training.seed, begun) + state_in_words(state.step, state.plans)
+    write_bundle(folder, state.averaged, examples, training.name, source)
+    return Reached(state.step, steps)
 
 
 def _device(name: str) -> torch.device:
@@ -161,19 +138,18 @@ def _begun(training: Training, begin: dict[str, Tensor] | None, device: torch.de
     drawn = new_parameters(training.seed) if begin is None else begin
     parameters = {name: value.to(device).requires_grad_() for name, value in drawn.items()}
     averaged = {name: value.detach().clone() for name, value in parameters.items()}
-    return _State(parameters, averaged, _optimiser(parameters, training), 0, [])
+    return _State(parameters, averaged, _optimiser(parameters, training), 0, [], [training.steps or STEPS])
 
 
 def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.optim.AdamW:
     return torch.optim.AdamW(parameters.values(), lr=training.rate, weight_decay=_DECAY)
 
 
-def _stepped(state: _State, examples: Examples, training: Training) -> dict[str, float]:
-    """One step on; the parts of its loss."""
-    step, warm = state.step, max(1.0, _WARM_UP * training.steps)
-    share = min((step + 1) / warm, 0.5 * (1.0 + math.cos(math.pi * step / training.steps)))
+def _stepped(state: _State, examples: Examples, training: Training, steps: int) -> dict[str, Tensor]:
+    """Take one step; return the parts of its loss."""
+    step = state.step
     for group in state.optimiser.param_groups:
-        group["lr"] = training.rate * share
+        group["lr"] = training.rate * rate_share(step, steps)
     parts = losses(state.parameters, examples.drawn(training.seed, step, training.batch))
     state.optimiser.zero_grad(set_to_none=True)
     torch.stack([_WEIGHTS[name] * part for name, part in parts.items()]).sum().backward()
@@ -184,9 +160,7 @@ def _stepped(state: _State, examples: Examples, training: Training) -> dict[str,
         torch._foreach_lerp_(
             list(state.averaged.values()), [one.detach() for one in state.parameters.values()], 1.0 - kept
         )
-    if not training.looks_after(step + 1):
-        return {}
-    return {f"{name}_loss": float(part.detach()) for name, part in parts.items()}
+    return {name: part.detach() for name, part in parts.items()}
 
 
 def losses(parameters: Parameters, batch: Batch) -> dict[str, Tensor]:
@@ -249,6 +223,7 @@ def _write(path: Path, state: _State, spec: dict[str, Any]) -> None:
         "spec": spec,
         "step": state.step,
         "curve": state.curve,
+        "plans": state.plans,
         "parameters": {name: value.detach() for name, value in state.parameters.items()},
         "averaged": state.averaged,
         "optimiser": state.optimiser.state_dict(),
@@ -258,22 +233,17 @@ def _write(path: Path, state: _State, spec: dict[str, Any]) -> None:
 
 
 def _read(path: Path, training: Training, spec: dict[str, Any], device: torch.device) -> _State:
-    """What was kept. Raises RunError where it is of another training."""
+    """Read a checkpoint. Raises RunError where it is of another training."""
     try:
         held = torch.load(path, map_location="cpu", weights_only=True)
         was, curve = held["spec"], held["curve"]
+        plans = held["plans"] if "plans" in held else [was["steps"]]
         parameters = {name: value.to(device).requires_grad_() for name, value in held["parameters"].items()}
         optimiser = _optimiser(parameters, training)
         optimiser.load_state_dict(held["optimiser"])
         averaged, step = {name: value.to(device) for name, value in held["averaged"].items()}, held["step"]
     except Exception as error:
-        raise RunError(f"{path}: cannot be gone on with: {error}: delete it and train anew") from error
-    if different := [name for name in spec if was.get(name) != spec[name]]:
-        told = ", ".join(f"{name} {was.get(name)}, not {spec[name]}" for name in different)
-        raise RunError(f"{path}: of another training: {told}: go on as it was begun, or choose another folder")
-    return _State(parameters, averaged, optimiser, step, curve)
-
-
-def _write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
-    lines = [",".join(curve[0]), *(",".join(f"{value:.6g}" for value in row.values()) for row in curve)]
-    write_whole(folder / CURVE, ("\n".join(lines) + "\n").encode())
+        raise RunError(f"{path}: cannot be continued: {error}: delete it and train anew") from error
+    refuse_another(path, was, spec)
+    steps = planned_steps(path, training.steps, plans[-1], step)
+    return _State(parameters, averaged, optimiser, step, curve, plans if steps == plans[-1] else [*plans, steps])

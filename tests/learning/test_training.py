@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -17,20 +18,23 @@ import pytest
 from cosim.core.errors import CosimError
 from cosim.core.packed import Packed
 from cosim.episode.ports import CameraSpec, Observation
+from cosim.policies.load import load_policy
 from cosim.policies.onnx.feeding import Feeder
 from cosim.policies.onnx.graph import TensorPort
 from cosim.policies.onnx.manifest import BundleManifest
 from cosim.spec.goal import PointGoal
 from cosim.spec.robot import COURIER
+from tests.conftest import Cosim
 
-torch = pytest.importorskip("torch", reason="PyTorch is not installed: pip install 'sidewalk-cosim[train]'")
+torch = pytest.importorskip("torch", reason="PyTorch is not installed: see `cosim train --help`")
 onnx = pytest.importorskip("onnx")
 
 from cosim.learning.bundle import bundle_facts, manifest_of, source_of  # noqa: E402
 from cosim.learning.examples import Examples, mirror  # noqa: E402
 from cosim.learning.graph import INPUTS, graph_of, parameters_of  # noqa: E402
 from cosim.learning.network import CRUISE_MPS, HEIGHT_PX, WAYPOINTS, WIDTH_PX, new_parameters  # noqa: E402
-from cosim.learning.training import Training, train  # noqa: E402
+from cosim.learning.settings import Training  # noqa: E402
+from cosim.learning.training import train  # noqa: E402
 
 CPU = torch.device("cpu")
 BRISK = Training(steps=4, batch=4, device="cpu")
@@ -77,12 +81,17 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def learned(data: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A bundle that has learned from that street."""
     folder = tmp_path_factory.mktemp("learned")
-    assert train([data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([]))
+    assert train([data], folder, Training(steps=60, batch=12, rate=2e-3, device="cpu"), False, heard([])).whole
     return folder
 
 
 def heard(rows: list[dict[str, float]]) -> Any:
-    return lambda step, row: rows.append(dict(row)) if row else None
+    return lambda step, steps, row: rows.append(dict(row)) if row else None
+
+
+def steps_of(folder: Path) -> list[str]:
+    """The first column of a curve."""
+    return [line.partition(",")[0] for line in (folder / "curve.csv").read_text().splitlines()]
 
 
 def plans(folder: Path, rows: Sequence[int]) -> np.ndarray:
@@ -128,20 +137,52 @@ def test_a_camera_of_which_a_part_was_seen_shows_the_same_part_again() -> None:
 
 def test_a_training_that_was_stopped_ends_as_one_in_one_piece(data: Path, tmp_path: Path) -> None:
     """Stopped after each step and gone on with, it writes the same graph to the byte, and the same curve."""
-    assert train([data], tmp_path / "whole", BRISK, False, heard([]))
+    assert train([data], tmp_path / "whole", BRISK, False, heard([])).whole
     pieces = 1
-    while not train([data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])):
-        assert not (tmp_path / "pieces" / "model.onnx").exists()
+    while not train([data], tmp_path / "pieces", replace(BRISK, minutes=1e-9), True, heard([])).whole:
         pieces += 1
     assert pieces == BRISK.steps
     for name in ("model.onnx", "curve.csv"):
         assert (tmp_path / "pieces" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
 
 
+def test_a_training_whose_time_is_over_leaves_a_bundle_and_its_curve(data: Path, tmp_path: Path, cosim: Cosim) -> None:
+    """`cosim train --minutes`, far too short: exit code 1, a bundle that can be loaded and says at which step it is, a
+    curve with a row of that step, and how to continue; `--resume` alone ends it."""
+    words = ("train", str(data), "-o", "small", "--batch", "4", "--device", "cpu", "--seed", "3")
+    done = cosim(*words, "--steps", "3", "--minutes", "1e-9", cwd=tmp_path)
+    assert done.returncode == 1 and "stopped at step 1 of 3. Continue with --resume" in done.stderr, done.stderr
+    assert steps_of(tmp_path / "small") == ["step", "1"]
+    manifest = json.loads((tmp_path / "small/manifest.json").read_bytes())
+    assert manifest["source"] == "cosim train, seed 3, on what orca drove; step 1 of 3"
+    assert load_policy(f"onnx:{tmp_path / 'small'}").manifest.name == "small"
+    done = cosim(*words, "--resume", cwd=tmp_path)
+    assert done.returncode == 0 and "more steps: --resume --steps 6" in done.stderr, done.stderr
+    assert json.loads((tmp_path / "small/manifest.json").read_bytes())["source"].endswith("on what orca drove")
+
+
+def test_a_finished_training_is_continued_with_more_steps(data: Path, tmp_path: Path) -> None:
+    """Four steps, then six: a curve of both, another graph, the same again to the byte, and the bundle says so. Fewer
+    steps than are done are refused."""
+    for name in ("one", "other"):
+        assert train([data], tmp_path / name, BRISK, False, heard([])).whole
+        before = (tmp_path / name / "model.onnx").read_bytes()
+        assert train([data], tmp_path / name, replace(BRISK, steps=6), True, heard([])) == (6, 6)
+        assert (tmp_path / name / "model.onnx").read_bytes() != before
+    for name in ("model.onnx", "curve.csv"):
+        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "other" / name).read_bytes()
+    assert steps_of(tmp_path / "one") == ["step", "4", "6"]
+    assert bundle_facts(tmp_path / "one").name == "small"
+    source = json.loads((tmp_path / "one/manifest.json").read_bytes())["source"]
+    assert source.endswith("on what orca drove; 4 steps, continued to 6")
+    with pytest.raises(CosimError, match=r"6 steps are done, and --steps asks for 5 in all: give more than 6"):
+        train([data], tmp_path / "one", replace(BRISK, steps=5), True, heard([]))
+
+
 def test_it_can_be_trained_on_from_the_shipped_graph_alone(learned: Path, data: Path, tmp_path: Path) -> None:
     """The graph holds the parameters that training begins with: at a rate of next to nothing it stays as it is."""
     held = parameters_of(learned / "model.onnx")
-    assert train([data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([]))
+    assert train([data], tmp_path / "on", replace(BRISK, begin=learned, rate=1e-12), False, heard([])).whole
     for name, value in parameters_of(tmp_path / "on" / "model.onnx").items():
         torch.testing.assert_close(value, held[name], atol=1e-6, rtol=0)
     drawn = new_parameters(3)
@@ -235,7 +276,7 @@ def test_what_is_held_out_is_whole_episodes_and_never_learned_from(data: Path) -
         ("file", r"other\.npz: no packed demonstrations"),
         ("begin", r"model\.onnx: cannot be read: No such file"),
         ("graph", r"model\.onnx: no ONNX graph"),
-        ("folder", r"holds a training: go on with it by --resume"),
+        ("folder", r"holds a training: continue it by --resume"),
         ("another", r"of another training: seed 0, not 1"),
         ("other data", r"of another training: data [0-9a-f]{16}, not [0-9a-f]{16}:"),
         ("other begin", r"of another training: from None, not [0-9a-f]{16}:"),

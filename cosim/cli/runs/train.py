@@ -12,6 +12,7 @@ import typer
 from cosim.cli.options.panels import LEARN
 from cosim.cli.terminal.consoles import err
 from cosim.core.errors import SOME_CRASHED, MachineError
+from cosim.learning.settings import STEPS, TO_INSTALL, Training
 
 train_app = typer.Typer()
 
@@ -28,26 +29,36 @@ def train_command(
     begin: Annotated[
         Path | None, typer.Option("--from", metavar="FOLDER", help="Begin with the bundle of another training.")
     ] = None,
-    steps: Annotated[int, typer.Option(min=1, help="Batches that are learned from.")] = 20_000,
+    steps: Annotated[
+        int | None,
+        typer.Option(
+            min=1, help="Batches that are learned from, in all.", show_default=f"{STEPS}; with --resume as before"
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the first parameters, the batches and what is held out.")] = 0,
     batch: Annotated[int, typer.Option(min=1, help="Examples a step.")] = 256,
     rate: Annotated[float, typer.Option(help="Of learning; it rises to this and falls to 0.")] = 1e-3,
     device: Annotated[str, typer.Option(help="cpu, cuda, cuda:1; by default a GPU if there is one.")] = "",
     minutes: Annotated[
-        float, typer.Option(help="Stop after so long, with exit code 1: --resume goes on.", show_default="no limit")
+        float,
+        typer.Option(
+            help="Stop after so long, with a bundle and exit code 1: --resume continues.", show_default="no limit"
+        ),
     ] = math.inf,
     name: Annotated[str, typer.Option(help="The policy's name in records and tables.")] = "small",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with the training in the folder.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue the training in the folder.")] = False,
 ) -> None:
     """Train a small policy that sees on demonstrations, and write it as a bundle for --policy onnx:FOLDER.
 
-    Its state is kept every minute. Needs PyTorch and onnx, and no engine: `python -m cosim.learning` is the same
-    command in a Python that has these and NumPy alone.
+    Its state is kept every minute. A finished training continues with `--resume` and larger `--steps`.
+
+    Needs PyTorch and onnx, and no engine. Install the CPU build first, unless you have an NVIDIA GPU:
+    `pip install torch --index-url https://download.pytorch.org/whl/cpu`. `python -m cosim.learning` is the same command
+    in a Python that has PyTorch, onnx and NumPy alone.
     """
     if lacking := [package for package in ("torch", "onnx") if find_spec(package) is None]:
-        raise MachineError(f"{' and '.join(lacking)} cannot be imported: pip install 'sidewalk-cosim[train]'")
+        raise MachineError(f"{' and '.join(lacking)} cannot be imported: {TO_INSTALL}")
     from cosim.learning.progress import trained
-    from cosim.learning.training import Training
 
     training = Training(
         steps=steps, seed=seed, batch=batch, rate=rate, device=device, begin=begin, minutes=minutes, name=name

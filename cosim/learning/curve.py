@@ -1,0 +1,37 @@
+"""The curve of a training, a row for each look at the held-out episodes: a file and a picture. Needs no PyTorch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from cosim.core.whole_file import write_whole
+
+CURVE: Final = "curve.csv"
+PICTURE: Final = "curve.png"
+
+
+def write_curve(folder: Path, curve: Sequence[Mapping[str, float]]) -> None:
+    """Write the rows as `curve.csv`. OSError passes."""
+    lines = [",".join(curve[0]), *(",".join(f"{value:.6g}" for value in row.values()) for row in curve)]
+    write_whole(folder / CURVE, ("\n".join(lines) + "\n").encode())
+
+
+def draw_curve(folder: Path) -> None:
+    """Draw `curve.csv` as `curve.png`: losses, and errors of the held-out episodes, by step. Needs matplotlib."""
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    names, *rows = [line.split(",") for line in (folder / CURVE).read_text().splitlines()]
+    columns = {name: [float(row[i]) for row in rows] for i, name in enumerate(names)}
+    steps = columns.pop("step")
+    figure, axes = plt.subplots(2, 5, figsize=(15, 5), layout="constrained")
+    for axis, (name, values) in zip(axes.flat, columns.items(), strict=False):
+        axis.plot(steps, values, marker="o" if len(steps) == 1 else "")
+        axis.set_title(name.replace("_", " "))
+        axis.grid(alpha=0.3)
+    figure.savefig(folder / PICTURE)
+    plt.close(figure)
