@@ -8,7 +8,7 @@ from pathlib import Path
 
 from cosim.core.errors import SOME_CRASHED, CosimError
 from cosim.learning.progress import trained
-from cosim.learning.settings import STEPS, Training
+from cosim.learning.settings import PLANNED_STEPS, Training
 
 
 def _main() -> None:
@@ -18,7 +18,7 @@ def _main() -> None:
     parser.add_argument("data", nargs="+", type=Path, help="packed demonstrations: cosim dataset pack")
     parser.add_argument("-o", "--out", type=Path, required=True, help="the folder of the bundle")
     parser.add_argument("--from", dest="begin", type=Path, help="a bundle to train on from")
-    parser.add_argument("--steps", type=int, help=f"in all; by default {STEPS}, or as planned before")
+    parser.add_argument("--steps", type=int, help=f"in all; by default {PLANNED_STEPS}, or as planned before")
     parser.add_argument("--seed", type=int, default=default.seed)
     parser.add_argument("--batch", type=int, default=default.batch)
     parser.add_argument("--rate", type=float, default=default.rate)

@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 
 from cosim.core.errors import RunError, UsageError
 
-STEPS: Final = 20_000
+PLANNED_STEPS: Final = 20_000
 """A training has so many steps unless others are asked for."""
 _LOOKS: Final = 20
 """The held-out episodes are looked at so often in a training, at least _STEPS_APART steps apart: a look takes as long
@@ -30,7 +30,7 @@ TO_INSTALL: Final = (
 class Training:
     """How a training is done. Raises UsageError.
 
-    steps: in all, from the first one on; None for those of the training that is continued, else STEPS. batch: examples
+    steps: in all, from the first one on; None for those of the training that is continued, else PLANNED_STEPS. batch: examples
     a step. rate: the highest rate of learning. device: "" for the GPU if there is one. begin: a bundle whose
     parameters it begins with; None for new ones. minutes: it stops after so long, with a bundle of what it has learned
     by then, and can be continued. name: of the policy.

@@ -27,7 +27,7 @@ from cosim.learning.examples import Batch, Examples
 from cosim.learning.graph import parameters_of
 from cosim.learning.network import CRUISE_MPS, TURN_BINS, Parameters, answers, new_parameters, plan, turns_radps
 from cosim.learning.settings import (
-    STEPS,
+    PLANNED_STEPS,
     Reached,
     Training,
     looks_after,
@@ -138,7 +138,7 @@ def _begun(training: Training, begin: dict[str, Tensor] | None, device: torch.de
     drawn = new_parameters(training.seed) if begin is None else begin
     parameters = {name: value.to(device).requires_grad_() for name, value in drawn.items()}
     averaged = {name: value.detach().clone() for name, value in parameters.items()}
-    return _State(parameters, averaged, _optimiser(parameters, training), 0, [], [training.steps or STEPS])
+    return _State(parameters, averaged, _optimiser(parameters, training), 0, [], [training.steps or PLANNED_STEPS])
 
 
 def _optimiser(parameters: Mapping[str, Tensor], training: Training) -> torch.optim.AdamW:

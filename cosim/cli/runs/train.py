@@ -12,7 +12,7 @@ import typer
 from cosim.cli.options.panels import LEARN
 from cosim.cli.terminal.consoles import err
 from cosim.core.errors import SOME_CRASHED, MachineError
-from cosim.learning.settings import STEPS, TO_INSTALL, Training
+from cosim.learning.settings import PLANNED_STEPS, TO_INSTALL, Training
 
 train_app = typer.Typer()
 
@@ -32,7 +32,9 @@ def train_command(
     steps: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Batches that are learned from, in all.", show_default=f"{STEPS}; with --resume as before"
+            min=1,
+            help="Batches that are learned from, in all.",
+            show_default=f"{PLANNED_STEPS}; with --resume as before",
         ),
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Of the first parameters, the batches and what is held out.")] = 0,
