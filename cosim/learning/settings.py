@@ -31,9 +31,9 @@ class Training:
     """How a training is done. Raises UsageError.
 
     steps: in all, from the first one on; None for those of the training that is continued, else PLANNED_STEPS.
-    batch: examples a step. rate: the highest rate of learning. device: "" for the GPU if there is one. begin: a bundle whose
-    parameters it begins with; None for new ones. minutes: it stops after so long, with a bundle of what it has learned
-    by then, and can be continued. name: of the policy.
+    batch: examples a step. rate: the highest rate of learning. device: "" for the GPU if there is one.
+    begin: a bundle whose parameters it begins with; None for new ones. name: of the policy. minutes: it stops after so
+    long, with a bundle of what it has learned by then, and can be continued.
     """
 
     steps: int | None = None
