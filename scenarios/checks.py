@@ -11,7 +11,7 @@ from types import MappingProxyType
 import msgspec
 import numpy as np
 
-from cosim.core.baked import cache_folder
+from cosim.core.cache import cache_folder
 from cosim.core.errors import EngineError, MachineError
 from cosim.core.versions import versions
 from cosim.place.walk_graph import WalkGraph

@@ -9,6 +9,7 @@ import typer
 from rich.markup import escape
 
 from cosim.cli.bench.bench import bench_app
+from cosim.cli.installation.cache import cache_app
 from cosim.cli.installation.verify import installation_app
 from cosim.cli.network.certs import certs_app
 from cosim.cli.network.direct import direct_app
@@ -40,6 +41,7 @@ from cosim.cli.suites.scenario import scenario_app
 from cosim.cli.suites.suite import suite_app
 from cosim.cli.terminal.consoles import err
 from cosim.cli.terminal.streams import told_streams
+from cosim.core.cache import cache_limit_bytes
 from cosim.core.errors import CosimError, of_file
 
 app = typer.Typer(
@@ -55,7 +57,7 @@ app = typer.Typer(
     "nobody read what it printed.",
 )
 for commands in (
-    *(run_app, list_app, show_app, installation_app),
+    *(run_app, list_app, show_app, installation_app, cache_app),
     *(look_app, film_app, report_app, replay_app, export_app, counterfactual_app),
     *(live_app, direct_app, serve_app, merge_app, coordinator_app, status_app),
     *(bench_app, score_app, compare_app, collect_app, train_app),
@@ -85,7 +87,8 @@ def common(
         bool, typer.Option("--version", callback=_say_versions, is_eager=True, help="Say the versions and end.")
     ] = False,
 ) -> None:
-    """Options of `cosim` itself."""
+    """Options of `cosim` itself. A limit of the cache that is none is refused before anything is made."""
+    cache_limit_bytes()
 
 
 def main() -> None:

@@ -7,14 +7,10 @@ it stands on. What is damaged is made anew; a cache that cannot be written is do
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
-import sys
 import tempfile
-import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
@@ -22,26 +18,15 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from platformdirs import user_cache_path
+
+from cosim.core.cache import MAKING, cache_folder, make_room, say_not_kept, use_entry
 
 Arrays = Mapping[str, NDArray[Any]]
 
 _FOLDER: Final = "baked"
-MAKING: Final = ".making-"
-"""How the names of what is half made begin."""
 _SEAL: Final = "seal.json"
-_LEFT_OVER_S: Final = 3600.0
-"""What is in the making for longer than this belongs to a process that was killed."""
-_UNUSED_S: Final = 30 * 86400.0
-_MOST_BYTES: Final = 1 << 30
-"""What was not used for longer than this, or not last among so much, is taken away."""
 _MADE_WITH: Final = ("numpy", "opencv-python-headless", "pybullet", "scipy", "shapely")
 """Packages that what is baked depends on."""
-
-
-def cache_folder() -> Path:
-    """Where what was made is kept: $COSIM_CACHE, else the user's cache folder (~/.cache/sidewalk-cosim)."""
-    return Path(os.environ.get("COSIM_CACHE") or user_cache_path("sidewalk-cosim"))
 
 
 def sources_hash(*rooms: Path) -> str:
@@ -60,6 +45,7 @@ def baked(name: str, made_by: str, make: Callable[[], Arrays]) -> Arrays:
     name: of the file name, with everything `make` was told; made_by: the `sources_hash` of what it is made by.
     """
     folder = cache_folder() / _FOLDER / f"{name}-{made_by}"
+    use_entry(folder)
     with suppress(OSError, ValueError, msgspec.DecodeError):
         return _read(folder)
     arrays = {key: np.ascontiguousarray(array) for key, array in make().items()}
@@ -82,14 +68,13 @@ def _read(folder: Path) -> Arrays:
             if hashlib.file_digest(file, "sha256").hexdigest() != seal:
                 raise ValueError(f"{folder / key}.npy: not what was written")
         arrays[key] = np.load(folder / f"{key}.npy", mmap_mode="r", allow_pickle=False)
-    mark_used(folder)
     return arrays
 
 
 def _keep(folder: Path, arrays: Arrays) -> None:
     """In one move: several processes may make the same at once, and the first wins."""
     folder.parent.mkdir(parents=True, exist_ok=True)
-    forget_unused(folder)
+    make_room()
     making = Path(tempfile.mkdtemp(prefix=MAKING, dir=folder.parent))
     try:
         seals = {}
@@ -109,41 +94,3 @@ def _keep(folder: Path, arrays: Arrays) -> None:
             making.rename(folder)
     finally:
         shutil.rmtree(making, ignore_errors=True)
-
-
-def mark_used(folder: Path) -> None:
-    """Keep a folder of kept files from being forgotten, where that may be written."""
-    with suppress(OSError):
-        os.utime(folder)
-
-
-def forget_unused(mine: Path) -> None:
-    """Take away the neighbours of a folder that nobody has used for long, those used last being kept as far as there
-    is room, and what processes that were killed left half made."""
-    found = [(_when(path), path) for path in mine.parent.iterdir() if path != mine]
-    held = 0
-    for when_s, path in sorted(found, reverse=True):
-        with suppress(OSError):
-            held += sum(file.stat().st_size for file in os.scandir(path))
-        kept_s = _LEFT_OVER_S if path.name.startswith(MAKING) else _UNUSED_S
-        if time.time() - when_s > kept_s or held > _MOST_BYTES:
-            shutil.rmtree(path, ignore_errors=True)
-            with suppress(OSError):
-                path.unlink()
-
-
-def _when(path: Path) -> float:
-    try:
-        return path.stat().st_mtime
-    except OSError:  # somebody else has just taken it away
-        return 0.0
-
-
-def say_not_kept(folder: Path, error: Exception) -> None:
-    """That the cache is done without, in one line on standard error, once in a process."""
-    _say_once(f"note: {folder}: not kept for the next process, which makes it anew: {error}")
-
-
-@cache
-def _say_once(words: str) -> None:
-    print(words, file=sys.stderr, flush=True)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import tempfile
-from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from functools import lru_cache
@@ -20,15 +19,11 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from cosim.core.baked import MAKING, Arrays, cache_folder, forget_unused, mark_used, say_not_kept
+from cosim.core.baked import Arrays
+from cosim.core.cache import MAKING, cache_folder, make_room, say_not_kept, use_entry
 
 _SEAL_BYTES: Final = 32
 _ALIGNED: Final = 16
-_OFTEN: Final = 1000
-"""After so many that a process has written, it takes away once more what is no longer used: to look through a full
-cache takes as long as to make some ten of them."""
-_written: Final = Counter[Path]()
-"""How many this process has written to the folder of a kind."""
 
 _Table = list[tuple[str, bytes, tuple[int, ...], int]]
 """Name, dtype as JSON, shape and start of each array of a file."""
@@ -41,12 +36,13 @@ class Pieces:
     def __init__(self, kind: str, made_of: str) -> None:
         self._folder = cache_folder() / kind / made_of if made_of else None
         if self._folder is not None:
-            mark_used(self._folder)
+            use_entry(self._folder)
 
     def get(self, name: str, make: Callable[[], Arrays]) -> Arrays:
         """What `make` makes, write-protected: from the cache, else made now and kept."""
         if self._folder is None:
             return _protected(make())
+        use_entry(self._folder)
         path = self._folder / name
         with suppress(OSError, ValueError, msgspec.DecodeError):
             return _read(path)
@@ -60,9 +56,7 @@ class Pieces:
     def _keep(self, path: Path, arrays: Arrays) -> None:
         """In one move: several processes may make the same at once, and the last wins."""
         path.parent.mkdir(parents=True, exist_ok=True)
-        if _written[path.parent.parent] % _OFTEN == 0:
-            forget_unused(path.parent)
-        _written[path.parent.parent] += 1
+        make_room()
         handle, name = tempfile.mkstemp(prefix=MAKING, dir=path.parent.parent)
         making = Path(name)
         try:

@@ -31,5 +31,18 @@ def milliseconds(ms: float) -> str:
     return f"{ms:.3g} ms" if abs(ms) < 999.5 else f"{ms:,.0f} ms"
 
 
+def bytes_in_words(count: float) -> str:
+    """A size in words, to three figures, in decimal units as disks have them: 812 B, 4.2 MB, 1.62 GB.
+
+    >>> bytes_in_words(812), bytes_in_words(4_200_000), bytes_in_words(1_618_000_000)
+    ('812 B', '4.2 MB', '1.62 GB')
+    """
+    for unit in ("B", "kB", "MB"):
+        if count < 999.5:
+            return f"{count:.3g} {unit}"
+        count /= 1000.0
+    return f"{count:.3g} GB" if count < 999.5 else f"{count:,.0f} GB"
+
+
 def untold(stage: str, share: float | None = None, /) -> None:
     """Nobody wants to know."""

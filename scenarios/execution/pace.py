@@ -19,7 +19,7 @@ from typing import Final, NamedTuple
 import msgspec
 import numpy as np
 
-from cosim.core.baked import cache_folder
+from cosim.core.cache import cache_folder
 from cosim.core.clock import Clock
 from cosim.core.errors import CosimError
 from cosim.core.telling import duration

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from cosim.core.baked import cache_folder
+from cosim.core.cache import cache_folder, make_room, use_entry
 from cosim.core.errors import MapError, unwritable
 from cosim.spec.scenario import City
 from sumo_nets.net.net_hash import net_content_hash
@@ -29,8 +29,10 @@ def city_net(city: City) -> Path:
     Raises MapError when `city.net_hash` is set and the net is another one.
     """
     path = cache_folder() / f"{city.name}-g{GENERATOR}.net.xml"
+    use_entry(path)
     if not is_whole(path):
         try:
+            make_room()
             build_city(city, path)
         except OSError as error:
             raise unwritable(path, error, "set COSIM_CACHE to another folder") from error

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from cosim.core.baked import cache_folder
+from cosim.core.cache import cache_folder
 from cosim.core.errors import MapError, UsageError, unknown, unwritable
 from cosim.core.telling import Tell, untold
 from cosim.place.map_check import MapCheck, check_map

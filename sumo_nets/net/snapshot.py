@@ -26,7 +26,7 @@ from shapely.geometry import MultiPolygon, Polygon
 
 import cosim
 import sumo_nets
-from cosim.core.baked import cache_folder, say_not_kept
+from cosim.core.cache import cache_folder, make_room, say_not_kept, use_entry
 from cosim.place.street_map import StreetMap
 
 SNAPSHOT_FOLDER: Final = "read"
@@ -57,10 +57,12 @@ def street_map_of(path: Path) -> StreetMap:
         return _read(path)
     made_of = _key(path.name, net)
     kept = cache_folder() / SNAPSHOT_FOLDER / f"{made_of}.map"
+    use_entry(kept)
     with suppress(OSError, ValueError, msgspec.DecodeError, shapely.errors.GEOSException):
         return thawed(kept.read_bytes()).read_of(made_of)
     street_map = _read(path).read_of(made_of)
     try:
+        make_room()
         _write(kept, map_as_bytes(street_map))
     except OSError as error:
         say_not_kept(kept.parent, error)

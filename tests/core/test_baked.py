@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from cosim.core import baked as module
+from cosim.core import cache as kept
 from cosim.core.baked import Arrays, baked, sources_hash
 from tests.conftest import PATIENCE_S, ROOT
 
@@ -33,7 +34,7 @@ class Maker:
 def room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of sources, and a cache of its own."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path / "cache"))
-    module._say_once.cache_clear()
+    kept._say_once.cache_clear()
     (tmp_path / "room").mkdir()
     (tmp_path / "room" / "maker.py").write_text("version = 1\n")
     return tmp_path / "room"

@@ -1,20 +1,17 @@
-"""Pieces that are kept: made once, never wrong, done without where they cannot be kept, and not for ever."""
+"""Pieces that are kept: made once, never wrong, and done without where they cannot be kept."""
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from cosim.core import baked as kept
-from cosim.core import pieces
-from cosim.core.baked import Arrays, baked
+from cosim.core import cache as kept
+from cosim.core.baked import Arrays
 from cosim.core.pieces import Pieces, _read
 from tests.conftest import PATIENCE_S
 
@@ -147,40 +144,3 @@ def test_who_is_killed_while_making_leaves_nothing_wrong(cache: Path) -> None:
     for file in files:
         (held,) = _read(file).values()
         assert len(held) == 300000 and (held == int(file.name)).all()
-
-
-def test_what_nobody_uses_is_forgotten(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Unused for a month, beyond the room there is, or half made by a process long dead: taken away, the rest kept."""
-    monkeypatch.setattr(pieces, "_OFTEN", 1)
-    make, now = Maker(), time.time()
-    for name, unused_s in (("month", 31 * 86400), ("long", 5000), ("lately", 4000), ("opened", 31 * 86400)):
-        Pieces("tiles", name).get("0_0", make)
-        os.utime(cache / "tiles" / name, (now - unused_s, now - unused_s))
-    half = cache / "tiles" / (kept.MAKING + "x")
-    half.write_bytes(b"half")
-    os.utime(half, (now - 5000, now - 5000))
-    assert same(Pieces("tiles", "opened").get("0_0", make)) and make.times == 4
-    size = (cache / "tiles/long/0_0").stat().st_size
-    monkeypatch.setattr(kept, "_MOST_BYTES", 2 * size)
-    Pieces("tiles", "new").get("0_0", make)
-    assert sorted(path.name for path in (cache / "tiles").iterdir()) == ["lately", "new", "opened"]
-
-
-def test_a_process_looks_for_what_nobody_uses_once_in_so_many_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many things they are of: to look through a full cache takes long."""
-    looked: list[Path] = []
-    monkeypatch.setattr(pieces, "forget_unused", looked.append)
-    monkeypatch.setattr(pieces, "_OFTEN", 4)
-    for name in "abcdef":
-        Pieces("tiles", name).get("0_0", Maker())
-    assert [folder.name for folder in looked] == ["a", "e"]
-
-
-def test_baked_arrays_that_nobody_uses_are_forgotten(cache: Path) -> None:
-    """What one version baked goes when it was not mapped for a month and another version bakes its own."""
-    for name in ("used", "unused"):
-        baked(name, "old", lambda: WANTED)
-        os.utime(cache / f"baked/{name}-old", (0, 0))
-    baked("used", "old", lambda: WANTED)
-    baked("used", "new", lambda: WANTED)
-    assert sorted(path.name for path in (cache / "baked").iterdir()) == ["used-new", "used-old"]

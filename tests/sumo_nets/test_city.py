@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import shapely
 
+from cosim.core.cache import forget_entries
 from cosim.core.errors import MapError, UsageError
 from cosim.place.street_map import StreetMap
 from cosim.spec.scenario import City
@@ -245,13 +246,19 @@ def test_city_is_equal_to_the_byte_in_another_process(
 
 @pytest.mark.engine
 def test_store_builds_once_and_refuses_another_net(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second request is served from the cache, and a scenario made on another net is refused with a remedy."""
+    """The second request is served from the cache, which says that it was used; what was not used for long makes room.
+    A scenario made on another net is refused with a remedy."""
     monkeypatch.setenv("COSIM_CACHE", str(tmp_path))
+    (tmp_path / "old.net.xml").write_text("<net/>")
+    os.utime(tmp_path / "old.net.xml", (0.0, 0.0))
     path = city_net(City(seed=9, size_m=200.0))
-    stamp = path.stat().st_mtime_ns
+    built = path.stat().st_ino
+    os.utime(path, (0.0, 0.0))
     assert city_net(City(seed=9, size_m=200.0, net_hash=net_content_hash(path))) == path
-    assert path.stat().st_mtime_ns == stamp
-    assert [p.name for p in tmp_path.iterdir()] == [path.name]
+    assert path.stat().st_ino == built and path.stat().st_mtime > 0.0
+    assert [p.name for p in tmp_path.iterdir() if not p.name.startswith(".")] == [path.name]
+    forget_entries(limit_bytes=0)
+    assert path.exists()
     with pytest.raises(MapError, match=r"made on 0123456789abcdef: delete the file to build it again"):
         city_net(City(seed=9, size_m=200.0, net_hash="0123456789abcdef"))
 

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cosim.core.baked import cache_folder
+from cosim.core.cache import cache_folder
 from cosim.core.errors import MapError, UsageError
 from cosim.place.route_line import through_corner
 from cosim.place.street_map import Port, StreetMap

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import shapely
 
+from cosim.core.cache import forget_entries
 from cosim.core.errors import MapError
 from cosim.spec.scenario import City
 from sumo_nets.city.store import city_net
@@ -60,6 +61,16 @@ def test_the_second_reading_comes_from_the_snapshot(net: Path, cache: Path, monk
     assert len(list(cache.iterdir())) == 1
     monkeypatch.setattr("sumo_nets.net.netfile.read_net", lambda _: pytest.fail("parsed again"))
     assert map_as_bytes(street_map_of(net)) == map_as_bytes(first)
+
+
+def test_who_keeps_a_snapshot_makes_room_first(net: Path, cache: Path) -> None:
+    """A snapshot that was not used for a month goes; the new one is in use, and stays whatever the limit."""
+    cache.mkdir(parents=True)
+    (cache / "old.map").write_bytes(b"old")
+    os.utime(cache / "old.map", (0.0, 0.0))
+    street_map_of(net)
+    assert [path.name == "old.map" for path in cache.iterdir()] == [False]
+    assert not forget_entries(limit_bytes=0).entries
 
 
 def test_a_damaged_snapshot_is_made_anew(net: Path, cache: Path) -> None:
