@@ -67,7 +67,8 @@ class EventMonitor:
         self._states = step.events.states
         self._furthest_m = max(self._furthest_m, step.route_s_after_m)
         people = step.street_after.people
-        shown = {name: people.xy[row] for row, name in enumerate(people.ids) if people.kind[row] == PersonKind.EVENT}
+        rows = np.flatnonzero(people.are(PersonKind.EVENT)).tolist()
+        shown = {people.ids[row]: people.xy[row] for row in rows}
         before, after = step.robot.pose, step.motion.robot.pose
         for i, (event, state) in enumerate(zip(self._events, self._states, strict=True)):
             places = {k: shown[name] for k, name in enumerate(event.names) if name in shown}

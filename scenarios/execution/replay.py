@@ -24,6 +24,7 @@ from cosim.spec.scenario import Scenario, read_suite
 from scenarios.execution.counterfactual import Beside, Compared
 from scenarios.execution.episode import Episode, Watch
 from scenarios.execution.run import drive
+from scenarios.execution.wiring import StagedScenario
 from sumo_nets.crowd.demand_log import Entrances
 
 OF_THE_ROAD: Final = 14
@@ -51,13 +52,23 @@ def recorded(folder: Path, scenario_id: str) -> Recorded:
     return Recorded(scenarios[scenario_id], record, Log.load(episode / "trajectory.npz"))
 
 
-def replaying(told: Recorded, camera: CameraChoice = "auto", *watches: Watch) -> tuple[Episode, Replay]:
-    """The recorded episode once more, not begun yet, and the policy that does what was done in it."""
+def replaying(
+    told: Recorded, camera: CameraChoice = "auto", *watches: Watch, judged_alone: bool = False
+) -> tuple[Episode, Replay]:
+    """The recorded episode once more, not begun yet, and the policy that does what was done in it.
+
+    judged_alone: leave out what is measured beside what the referee judges, for a replay whose result is not needed.
+    """
     options = EpisodeOptions(
         seed=told.record.run_seed, suite_hash=told.record.suite_hash, camera=camera, injections=told.record.injections
     )
     policy = Replay(told.log.command)
-    return Episode(told.scenario, policy.manifest, options, watches=watches), policy
+    through = _judge_alone if judged_alone else None
+    return Episode(told.scenario, policy.manifest, options, watches=watches, through=through), policy
+
+
+def _judge_alone(stage: StagedScenario) -> None:
+    stage.scorer.judge_alone()
 
 
 def replayed(told: Recorded, *watches: Watch, tell: Tell = untold) -> str:

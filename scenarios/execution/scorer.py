@@ -5,6 +5,7 @@ from __future__ import annotations
 import msgspec
 
 from cosim.core.clock import Clock
+from cosim.core.errors import UsageError
 from cosim.episode.in_flight import InFlight, median_ms
 from cosim.episode.log import Log
 from cosim.episode.step import Step
@@ -42,10 +43,17 @@ class Scorer:
         self._walked_into: list[Failure] = []
         self._red_lights: list[RedLightEntry] = []
         self._verdict = Verdict()
+        self._measures = True
+
+    def judge_alone(self) -> None:
+        """From now on ask the referee, and measure and record nothing: there will be no result."""
+        self._measures = False
 
     def score(self, step: Step) -> Verdict:
         """The referee's verdict on a Step, which is recorded with it."""
         verdict = self._verdict = self._referee.judge(step)
+        if not self._measures:
+            return verdict
         self._recorder.add(step, verdict, self._traffic.see(step))
         self._monitor.see(step)
         self._failures += verdict.failures
@@ -55,7 +63,12 @@ class Scorer:
         return verdict
 
     def result(self, begun: Record, commands: InFlight) -> tuple[Record, Log]:
-        """The record that was begun, with all that came out so far, and the log. commands: all that was answered."""
+        """The record that was begun, with all that came out so far, and the log. commands: all that was answered.
+
+        Raises UsageError after `judge_alone`.
+        """
+        if not self._measures:
+            raise UsageError("this episode was judged alone, nothing of it was recorded: it has no result")
         scenario, events = self._scenario, self._monitor.outcomes()
         log = self._recorder.log(self._monitor.tracks, commands)
         record = msgspec.structs.replace(

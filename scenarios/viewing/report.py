@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
+from collections.abc import MutableSequence, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Final, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
@@ -20,16 +20,17 @@ from cosim.core.errors import CosimError, unwritable
 from cosim.core.telling import Tell, untold
 from cosim.core.whole_file import write_whole
 from cosim.report.above import ROUTE, Sheet, draw_streets
-from cosim.report.page.choice import MOST_FAILURES, FailureToShow, most_telling, shown_of
+from cosim.report.page.choice import MOST_FAILURES, WITHIN_S, FailureToShow, most_telling, shown_of
 from cosim.report.page.page import Maps, colours_of, counts_of, page_of
 from cosim.report.page.plots import plots_of
-from cosim.report.page.reasons import mishaps_of, reason_of
+from cosim.report.page.reasons import Mishap, mishaps_of, reason_of
 from cosim.report.page.runs import ReportedRun, example_of, light_in_words, place_in_words, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
+from cosim.report.webp import image_url
 from cosim.spec.options import CameraChoice
 from cosim.spec.scenario import CityMap, Place, Scenario
 from scenarios.execution.places import place
-from scenarios.viewing.scenes import ShownAgain, image_url, show_again
+from scenarios.viewing.scenes import ShownAgain, show_again, ticks_to_show
 
 _MOST_BYTES: Final = 29_000_000
 """Of the file; failures beyond it are left out of the gallery, the least telling first."""
@@ -41,6 +42,7 @@ _MAP_QUALITY: Final = 70
 _MARGIN_M: Final = 25.0
 _MOST_SPOTS: Final = 300
 """Of a place."""
+_TELL_EVERY_S: Final = 0.2
 _T = TypeVar("_T")
 _Bounds = tuple[float, float, float, float]
 
@@ -55,24 +57,34 @@ class ReportFacts(NamedTuple):
 
 def make_report(
     folders: Sequence[Path], output: Path, *, camera: CameraChoice = "auto", jobs: int = 2, most: int = MOST_FAILURES,
-    tell: Tell = untold,
+    within_s: float = WITHIN_S, tell: Tell = untold,
 ) -> ReportFacts:  # fmt: skip
-    """Write the report of these run folders. most: failures in its gallery.
+    """Write the report of these run folders. most: failures in its gallery; within_s: later failures of an
+    episode are left out where an earlier one is shown.
 
     Raises what `read_runs` raises, and MachineError when it cannot be written; then nothing is.
     """
     runs = read_runs(folders, tell)
     plots = plots_of(runs, colours_of(runs), tell)
     candidates = shown_of(runs)
-    picks = most_telling(candidates, most)
+    picks = most_telling(candidates, most, within_s)
     tell("starting the engines")
-    with ProcessPoolExecutor(jobs, get_context("spawn"), initializer=end_with, initargs=(os.getpid(),)) as pool:
+    episodes, lost = _episodes(runs, picks)
+    context = get_context("spawn")
+    done = context.Array("d", max(len(episodes), 1), lock=False)
+    with ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(os.getpid(), done)) as pool:
         try:
-            showings = _showings(pool, runs, picks, camera, tell)
-            pictures = _pictures(pool, runs, tell)
+            again = [
+                pool.submit(_shown_again, k, runs[one.run].path, one.scenario, one.mishaps, camera)
+                for k, one in enumerate(episodes)
+            ]
+            drawn = _begun_pictures(pool, runs)
+            _wait([*again, *drawn], [one.ticks for one in episodes], done, tell)
+            pictures = [came for came in map(_outcome, drawn) if not isinstance(came, str)]
         except BaseException:
             pool.shutdown(wait=False, cancel_futures=True)
             raise
+    showings = lost | _showings(episodes, again)
     entries = [_entry(runs[pick.run], pick, showings[k]) for k, pick in enumerate(picks)]
     tell("writing the page")
     fixed = len(msgspec.json.encode(pictures)) + _REST_BYTES
@@ -88,32 +100,73 @@ def make_report(
     return ReportFacts(len(data), count, len(candidates))
 
 
-def _showings(
-    pool: ProcessPoolExecutor,
-    runs: Sequence[ReportedRun],
-    picks: Sequence[FailureToShow],
-    camera: CameraChoice,
-    tell: Tell,
-) -> list[ShownAgain | str]:
-    """Every pick shown again, or why it could not be. The longest replays begin first."""
-    episodes: dict[tuple[int, str], list[int]] = {}
+class _Episode(NamedTuple):
+    """An episode that is run again. picks: numbers of the failures that it shows; mishaps: these failures."""
+
+    run: int
+    scenario: str
+    picks: list[int]
+    mishaps: list[Mishap]
+
+    @property
+    def ticks(self) -> int:
+        """How long it takes to show them."""
+        return ticks_to_show(self.mishaps)
+
+
+def _episodes(runs: Sequence[ReportedRun], picks: Sequence[FailureToShow]) -> tuple[list[_Episode], dict[int, str]]:
+    """The episodes of the picks, those that take longest first; and of the picks that have none: why."""
+    numbers: dict[tuple[int, str], list[int]] = {}
+    lost: dict[int, str] = {}
     for k, pick in enumerate(picks):
-        episodes.setdefault((pick.run, pick.scenario), []).append(k)
-    found: list[ShownAgain | str] = [""] * len(picks)
-    asked: list[tuple[list[int], Future[list[ShownAgain]]]] = []
-    for (run, scenario), numbers in sorted(
-        episodes.items(), key=lambda item: -max(picks[k].mishap.tick for k in item[1])
-    ):
+        numbers.setdefault((pick.run, pick.scenario), []).append(k)
+    found = []
+    for (run, scenario), of_it in numbers.items():
         if runs[run].log(scenario) is None:
-            for k in numbers:
-                found[k] = "its trajectory is no longer in the run folder"
-            continue
-        mishaps = [picks[k].mishap for k in numbers]
-        asked.append((numbers, pool.submit(show_again, runs[run].path, scenario, mishaps, camera)))
-    for done, (numbers, future) in enumerate(asked):
-        tell("showing failures again", done / len(asked))
+            lost |= dict.fromkeys(of_it, "its trajectory is no longer in the run folder")
+        else:
+            found.append(_Episode(run, scenario, of_it, [picks[k].mishap for k in of_it]))
+    return sorted(found, key=lambda one: -one.ticks), lost
+
+
+_done: MutableSequence[float] = []
+"""In a process that shows failures again: how much is done of each episode, shared with the one that waits."""
+
+
+def _begin(parent: int, done: MutableSequence[float]) -> None:
+    """Begin a process that shows failures again."""
+    global _done
+    end_with(parent)
+    _done = done
+
+
+def _shown_again(
+    number: int, folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera: CameraChoice
+) -> list[ShownAgain]:
+    """In a process of its own. number: of the episode among those that are shown."""
+
+    def took(ticks: int) -> None:
+        _done[number] = ticks
+
+    return show_again(folder, scenario_id, mishaps, camera, took)
+
+
+def _wait(futures: Sequence[Future[Any]], ticks: Sequence[int], done: Sequence[float], tell: Tell) -> None:
+    """Wait for all of them. The first ones are episodes, which take so many ticks, and of which so many are done."""
+    left: set[Future[Any]] = set(futures)
+    while left:
+        left = wait(left, _TELL_EVERY_S, FIRST_COMPLETED).not_done
+        came = [all_of if future.done() else now for future, all_of, now in zip(futures, ticks, done, strict=False)]
+        share = min(sum(came) / max(sum(ticks), 1), 0.99)
+        tell("showing failures again" if ticks else "drawing maps", share if ticks else None)
+
+
+def _showings(episodes: Sequence[_Episode], again: Sequence[Future[list[ShownAgain]]]) -> dict[int, ShownAgain | str]:
+    """What came of every pick, by its number: the failure shown again, or why it could not be."""
+    found: dict[int, ShownAgain | str] = {}
+    for one, future in zip(episodes, again, strict=True):
         came = _outcome(future)
-        for place_of, k in enumerate(numbers):
+        for place_of, k in enumerate(one.picks):
             found[k] = came if isinstance(came, str) else came[place_of]
     return found
 
@@ -156,7 +209,7 @@ def _note(entries: Sequence[Entry]) -> str:
     return f"{len(lost)} of {len(entries)} failures could not be shown again. {lost[0].scenario}: {lost[0].why}"
 
 
-def _pictures(pool: ProcessPoolExecutor, runs: Sequence[ReportedRun], tell: Tell) -> list[PlacePicture]:
+def _begun_pictures(pool: ProcessPoolExecutor, runs: Sequence[ReportedRun]) -> list[Future[PlacePicture]]:
     """From above: every real place with failures, then those with the most."""
     there: dict[str, list[Scenario]] = {}
     for run in runs:
@@ -165,17 +218,10 @@ def _pictures(pool: ProcessPoolExecutor, runs: Sequence[ReportedRun], tell: Tell
             there.setdefault(place_in_words(scenario), []).append(scenario)
     failed = [name for name, (_, bad) in counts_of(runs).items() if bad]
     failed.sort(key=lambda name: not isinstance(there[name][0].place, CityMap))
-    asked = [
+    return [
         pool.submit(_place_picture, name, there[name][0].place, _bounds(there[name]), [s.route for s in there[name]])
         for name in failed[:_MOST_MAPS]
     ]
-    found = []
-    for done, future in enumerate(asked):
-        tell("drawing maps", done / len(asked))
-        came = _outcome(future)
-        if not isinstance(came, str):
-            found.append(came)
-    return found
 
 
 def _bounds(scenarios: Sequence[Scenario]) -> _Bounds:

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-import base64
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Set
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Final, NamedTuple
 
-import cv2
 import numpy as np
 import shapely
 
 from cosim.core.clock import Clock
 from cosim.core.geometry import Floats
-from cosim.core.state import PersonKind, RobotState, Street
+from cosim.core.state import PersonKind, Street
 from cosim.episode.following import Following
 from cosim.episode.ports import CameraSpec, Eyes
 from cosim.episode.step import Step
 from cosim.judge.referee import Verdict
 from cosim.place.street_map import StreetMap
 from cosim.report.above import street_areas
-from cosim.report.legend import Image
 from cosim.report.page.reasons import Mishap, Other
 from cosim.report.page.scene import CrossingLight, DrawnWay, Outline, Pictures, Scene, Track
+from cosim.report.webp import image_url
 from cosim.spec.obstacle import footprint
 from cosim.spec.options import CameraChoice
 from cosim.spec.robot import robot_called
@@ -40,6 +38,10 @@ PICTURED_S: Final = 5.0
 _STEP_TICKS: Final = 2
 """Between samples."""
 _PICTURE_TICKS: Final = 5
+"""Pictures are drawn at every fifth tick of the episode, and at the failure itself: failures that follow one another
+share theirs."""
+START_TICKS, PICTURE_TICKS = 400, 10
+"""To start the engines takes as long as to simulate so many ticks, to draw one moment as long as so many."""
 _PEOPLE_M: Final = 25.0
 _VEHICLES_M: Final = 40.0
 _GROUND_M: Final = 22.0
@@ -48,9 +50,16 @@ FOLLOW_PX: Final = (384, 216)
 _WIDEST_PX: Final = 320
 _TALLEST_PX: Final = 240
 """Of the robot's own camera, drawn larger or smaller than the policy saw it."""
-_QUALITY: Final = 58
 _OVER_SAMPLES: Final = 4
 """Over so many samples the velocity of who was met is taken."""
+
+
+Took = Callable[[int], None]
+"""Called with how much is done so far, of `ticks_to_show`."""
+
+
+def untimed(done: int) -> None:
+    """Default callback: ignores how much is done."""
 
 
 class ShownAgain(NamedTuple):
@@ -60,29 +69,60 @@ class ShownAgain(NamedTuple):
     other: Other | None
 
 
-def show_again(folder: Path, scenario_id: str, mishaps: Sequence[Mishap], camera: CameraChoice) -> list[ShownAgain]:
-    """Run a recorded episode again up to the last of these failures. Raises RunError when it comes out otherwise."""
+def ticks_to_show(mishaps: Sequence[Mishap]) -> int:
+    """Return how long it takes to show failures of one episode again, in ticks that could be simulated meanwhile."""
+    pictured = set[int]().union(*map(_pictured, mishaps))
+    return START_TICKS + _last_tick(mishaps) + PICTURE_TICKS * len(pictured)
+
+
+def _last_tick(mishaps: Sequence[Mishap]) -> int:
+    """The number of ticks up to the last failure."""
+    return max(mishap.tick for mishap in mishaps) + 1
+
+
+def _pictured(mishap: Mishap) -> frozenset[int]:
+    """The ticks of which the scene of a failure has pictures."""
+    first = max(0, mishap.tick - Clock().ticks(PICTURED_S))
+    return frozenset(range(-(-first // _PICTURE_TICKS) * _PICTURE_TICKS, mishap.tick, _PICTURE_TICKS)) | {mishap.tick}
+
+
+def show_again(
+    folder: Path,
+    scenario_id: str,
+    mishaps: Sequence[Mishap],
+    camera: CameraChoice,
+    took: Took = untimed,
+) -> list[ShownAgain]:
+    """Run a recorded episode again up to the last of these failures, every tick held against the recorded one.
+
+    Raises RunError when it comes out otherwise.
+    """
     told = recorded(folder, scenario_id)
     _, street_map = place(told.scenario.place)
     following = Following(told.log)
     reels = [_Reel(told, mishap, following.follows) for mishap in mishaps]
-    last = max(mishap.tick for mishap in mishaps) + 1
+    last = _last_tick(mishaps)
     with ExitStack() as stack:
-        episode, policy = replaying(told, camera)
+        episode, policy = replaying(told, camera, judged_alone=True)
         stack.enter_context(episode)
-        eyes = stack.enter_context(episode.eyes(reels[0].spec))
+        spec = robots_camera(told.record.camera)
+        # Each camera keeps what stands around its own place: one for both would sort that out again for each picture.
+        seen, outside = (stack.enter_context(episode.eyes(spec)) for _ in range(2))
+        shots = _Shots(told, spec, seen, outside, set[int]().union(*map(_pictured, mishaps)), following.follows)
         episode.watch(Alike(folder, told).watch)
 
         def watch(step: Step, verdict: Verdict) -> None:
             plan = following.take(step, verdict.reset is not None)
+            shots.take(step, plan)
             for reel in reels:
-                reel.take(step, eyes, plan)
+                reel.take(step, plan)
+            took(START_TICKS + step.tick + 1 + PICTURE_TICKS * len(shots))
 
         episode.watch(watch)
         observation = episode.reset()
         while not episode.over and episode.moment.tick < last:
             observation = episode.advance(policy.act(observation))
-        return [reel.showing(street_map, episode.footprint_m) for reel in reels]
+        return [reel.showing(street_map, episode.footprint_m, shots) for reel in reels]
 
 
 def robots_camera(spec: CameraSpec | None) -> CameraSpec:
@@ -95,45 +135,41 @@ def robots_camera(spec: CameraSpec | None) -> CameraSpec:
     )
 
 
-class _Reel:
-    """Collects the moments before one failure. spec: the robot's camera; follows: see `Following`."""
+class _Moment(NamedTuple):
+    """What a page shows of a tick: by the robot's camera and from behind, as data URLs, and the way ahead."""
 
-    def __init__(self, told: Recorded, mishap: Mishap, follows: int) -> None:
-        self._scenario, self._mishap, self._follows = told.scenario, mishap, follows
-        self.spec = robots_camera(told.record.camera)
-        self._first = max(0, mishap.tick - Clock().ticks(SHOWN_S))
-        self._first += (mishap.tick - self._first) % _STEP_TICKS
-        self._pictured = mishap.tick - Clock().ticks(PICTURED_S)
-        self._robot: list[tuple[float, ...]] = []
-        self._streets: list[Street] = []
-        self._plans: list[tuple[int, Floats | None]] = [(0, None)]
-        self._ways: list[DrawnWay] = []
-        self._at: list[int] = []
-        self._seen: list[str] = []
-        self._followed: list[str] = []
+    robot: str
+    follow: str
+    way: DrawnWay
+
+
+class _Shots:
+    """The pictures of an episode, each drawn once. spec: the robot's camera; seen, outside: the cameras that draw;
+    ticks: of which there are to be pictures; follows: see `Following`."""
+
+    def __init__(
+        self, told: Recorded, spec: CameraSpec, seen: Eyes, outside: Eyes, ticks: Set[int], follows: int
+    ) -> None:
+        self._scenario, self.spec, self._follows = told.scenario, spec, follows
+        self._seen, self._outside, self._ticks = seen, outside, ticks
+        self._moments: dict[int, _Moment] = {}
         self._ahead: Floats = np.zeros(2)
 
-    def take(self, step: Step, eyes: Eyes, plan: Floats | None) -> None:
+    def __len__(self) -> int:
+        return len(self._moments)
+
+    def __getitem__(self, tick: int) -> _Moment:
+        return self._moments[tick]
+
+    def take(self, step: Step, plan: Floats | None) -> None:
         """One tick. plan: the waypoints that are followed (`Following.take`)."""
-        before = self._mishap.tick - step.tick
-        if step.tick < self._first or before < 0:
-            return
         robot, street = step.motion.robot, step.street_after
         ahead = np.array([math.cos(robot.pose.heading_rad), math.sin(robot.pose.heading_rad)])
         self._ahead = 0.9 * self._ahead + 0.1 * ahead if self._ahead.any() else ahead
-        if before % _STEP_TICKS == 0:
-            self._robot.append((*robot.pose, robot.v_mps, step.command.v_mps, step.command.w_radps))
-            self._streets.append(street)
-            if plan is not self._plans[-1][1]:
-                self._plans.append((len(self._robot) - 1, plan))
-        if step.tick >= self._pictured and before % _PICTURE_TICKS == 0:
-            self._at.append(len(self._robot) - 1)
-            self._seen.append(image_url(eyes.render(robot, street).rgb))
-            self._ways.append(self._way(step, plan))
-            self._followed.append(self._behind(robot, street, eyes))
-
-    def _behind(self, robot: RobotState, street: Street, eyes: Eyes) -> str:
-        return image_url(eyes.picture(*eye_behind(robot, self._ahead), street, robot, FOLLOW_PX).rgb)
+        if step.tick in self._ticks:
+            behind = self._outside.picture(*eye_behind(robot, self._ahead), street, robot, FOLLOW_PX).rgb
+            seen = self._seen.render(robot, street).rgb
+            self._moments[step.tick] = _Moment(image_url(seen), image_url(behind), self._way(step, plan))
 
     def _way(self, step: Step, plan: Floats | None) -> DrawnWay:
         """What is followed, or where the command leads, in the robot's picture."""
@@ -148,7 +184,35 @@ class _Reel:
         follows = int(there[: self._follows].sum()) if there[self._follows] else -1
         return DrawnWay(tenths, _whole(10.0 * points[there]), follows)
 
-    def showing(self, street_map: StreetMap, size_m: tuple[float, float]) -> ShownAgain:
+
+class _Reel:
+    """Collects the moments before one failure. follows: see `Following`."""
+
+    def __init__(self, told: Recorded, mishap: Mishap, follows: int) -> None:
+        self._scenario, self._mishap, self._follows = told.scenario, mishap, follows
+        self._first = max(0, mishap.tick - Clock().ticks(SHOWN_S))
+        self._first += (mishap.tick - self._first) % _STEP_TICKS
+        self._pictured = _pictured(mishap)
+        self._robot: list[tuple[float, ...]] = []
+        self._streets: list[Street] = []
+        self._plans: list[tuple[int, Floats | None]] = [(0, None)]
+        self._at: list[int] = []
+
+    def take(self, step: Step, plan: Floats | None) -> None:
+        """One tick. plan: the waypoints that are followed (`Following.take`)."""
+        before = self._mishap.tick - step.tick
+        if step.tick < self._first or before < 0:
+            return
+        robot, street = step.motion.robot, step.street_after
+        if before % _STEP_TICKS == 0:
+            self._robot.append((*robot.pose, robot.v_mps, step.command.v_mps, step.command.w_radps))
+            self._streets.append(street)
+            if plan is not self._plans[-1][1]:
+                self._plans.append((len(self._robot) - 1, plan))
+        if step.tick in self._pictured:
+            self._at.append(len(self._robot) - 1)
+
+    def showing(self, street_map: StreetMap, size_m: tuple[float, float], shots: _Shots) -> ShownAgain:
         """All of it, around the robot's place at the failure."""
         track = np.array(self._robot)
         origin = np.round(track[-1, :2])
@@ -168,12 +232,16 @@ class _Reel:
             ground=self._ground(street_map, track[:, :2], origin),
             route=_ring(self._near(np.array(self._scenario.route), track[-1, :2]), origin),
             goal=tuple(_ring(np.array([self._scenario.goal]), origin)),  # type: ignore[arg-type]
-            pictures=Pictures(self._at, self._seen, self._followed, self._ways, (self.spec.width, self.spec.height)),
+            pictures=self._pictures(shots),
             hit=hit,
             plans=[(k, [] if plan is None else _ring(plan, origin)) for k, plan in self._plans[1:]],
             follows=self._follows,
         )
         return ShownAgain(scene, None if hit < 0 else _other(track[-1], tracks[hit], origin))
+
+    def _pictures(self, shots: _Shots) -> Pictures:
+        robot, follow, ways = zip(*(shots[tick] for tick in sorted(self._pictured)), strict=True)
+        return Pictures(self._at, list(robot), list(follow), list(ways), (shots.spec.width, shots.spec.height))
 
     def _near(self, route: Floats, where: Floats) -> Floats:
         """The stretch of the route that can be in view."""
@@ -261,9 +329,3 @@ def _whole(values: Floats) -> list[int]:
 
 def _ring(xy: Floats, origin: Floats) -> Outline:
     return _whole(100.0 * (xy[:, :2] - origin))
-
-
-def image_url(rgb: Image, quality: int = _QUALITY) -> str:
-    """A picture as it stands in a page."""
-    coded = cv2.imencode(".webp", rgb[..., ::-1], [cv2.IMWRITE_WEBP_QUALITY, quality])[1]
-    return "data:image/webp;base64," + base64.b64encode(coded.tobytes()).decode()

@@ -7,9 +7,11 @@ import json
 import os
 import re
 from collections.abc import Callable
+from concurrent.futures import Future
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import msgspec
 import numpy as np
 import pytest
@@ -24,7 +26,9 @@ from cosim.report.page.plots import exposure_of, near_of, plots_of
 from cosim.report.page.runs import ReportedRun, read_runs
 from cosim.report.page.scene import Entry, PlacePicture, Spot
 from cosim.report.page.three_tables import tables_html, warnings_html
+from cosim.report.webp import as_webp
 from cosim.spec.scenario import read_suite
+from scenarios.viewing.report import _wait
 from tests.conftest import ROOT, Cosim
 from tests.records.driven_runs import HIT, episode_of, failure_at, run_of, short_way
 
@@ -131,6 +135,46 @@ def test_what_takes_long_to_come_to_is_not_shown_where_something_else_tells_as_m
     ]
     assert most_telling([late[0], soon], 1) == [soon]
     assert len(most_telling([*late, soon])) == 6
+
+
+def test_of_an_episode_its_first_failure_is_shown_and_others_that_come_soon(tmp_path: Path) -> None:
+    """Failures after 4 s, 100 s and 200 s, each of another kind: the last is left out, but not where it is the first of
+    its episode, and not where it is asked for."""
+    runs = read_runs([run_of(tmp_path / "run", [HIT], "mine")])
+    (soon,) = shown_of(runs)
+    every = [
+        soon._replace(scenario=name, mishap=soon.mishap._replace(tick=tick), facets=soon.facets | {name, tick})
+        for name, tick in (("one", 80), ("one", 2000), ("one", 4000), ("other", 4000))
+    ]
+    picked = {(one.scenario, one.mishap.tick) for one in most_telling(every)}
+    assert picked == {("one", 80), ("one", 2000), ("other", 4000)}
+    assert len(most_telling(every, within_s=200.0)) == 4
+
+
+def test_how_far_the_failures_are_is_told_while_they_are_shown() -> None:
+    """Of two episodes of 100 and 300 ticks, the first done and the second half done: 62 %; of maps alone no share."""
+    first, second, told = Future[None](), Future[None](), list[tuple[str, float | None]]()
+    first.set_result(None)
+
+    def tell(stage: str, share: float | None = None) -> None:
+        told.append((stage, share))
+        if len(told) == 2:
+            second.set_result(None)
+
+    _wait([first, second], [100, 300], [20.0, 150.0], tell)
+    assert told[0] == ("showing failures again", 0.625) and told[-1] == ("showing failures again", 0.99)
+    _wait([first], [], [], lambda *words: told.append(words))  # type: ignore[arg-type]
+    assert told[-1] == ("drawing maps", None)
+
+
+@pytest.mark.parametrize("size", [(216, 384), (33, 41), (1, 1)])
+def test_pictures_of_a_page_are_read_again(size: tuple[int, int]) -> None:
+    """Of odd sizes too, with little error, by what OpenCV makes of them."""
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    rgb = np.stack([rows % 256, columns % 256, (rows + columns) % 256], axis=2).astype(np.uint8)
+    read = cv2.imdecode(np.frombuffer(as_webp(rgb), np.uint8), cv2.IMREAD_COLOR)
+    assert read is not None and read.shape == rgb.shape
+    assert np.abs(read[..., ::-1].astype(int) - rgb).mean() < 12.0
 
 
 def test_a_failure_counts_where_so_many_people_were_near() -> None:

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import base64
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from cosim.cli.terminal import progress
 from tests.chromium import CHROMIUM, Page, chromium
 from tests.conftest import Cosim
 from tests.report.blind import BEND
@@ -33,8 +35,12 @@ def report(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
     done = cosim("run", "reactive", *words, "--out", "run", cwd=folder)
     assert done.returncode == 0, done.stderr
     (folder / "report.html").write_text("another page")
-    done = cosim("report", "run", "--jobs", "1", "-o", "report.html", cwd=folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(progress, "AGAIN_S", 0.0)
+        done = cosim("report", "run", "--jobs", "1", "-o", "report.html", cwd=folder)
     assert done.returncode == 0, done.stderr
+    shares = [int(share) for share in re.findall(r"showing failures again: (\d+) %", done.stderr)]
+    assert len(shares) > 2 and shares == sorted(shares) and shares[-1] > 50, done.stderr
     assert "2 of 2 failures), in place of the one that was there" in done.stdout
     return folder / "report.html"
 

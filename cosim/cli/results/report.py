@@ -27,6 +27,14 @@ def report(
         "report.html"
     ),
     failures: Annotated[int, typer.Option(min=0, max=200, help="Show at most so many failures again.")] = 48,
+    within: Annotated[
+        float,
+        typer.Option(
+            metavar="SECONDS",
+            min=0.0,
+            help="Of an episode show its first failure, and others this soon: to come to later ones takes long.",
+        ),
+    ] = 150.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that show them again.")] = 2,
     camera: Annotated[Choice, typer.Option(metavar="CAMERA", help=CAMERA_HELP)] = "auto",
 ) -> None:
@@ -40,6 +48,6 @@ def report(
     instead = replaced(output)
     with doing("choosing the camera") as tell:
         drawn_by = camera_here(camera)
-        made = make_report(folders, output, camera=drawn_by, jobs=jobs, most=failures, tell=tell)
+        made = make_report(folders, output, camera=drawn_by, jobs=jobs, most=failures, within_s=within, tell=tell)
     size = f"{made.size_bytes / 1e6:.1f} MB, {made.shown} of {made.failures} failures"
     out.print(f"Report: {output} ({size}){instead}", soft_wrap=True, highlight=False)

@@ -18,6 +18,8 @@ _START_S: Final = 15.0
 """To start an episode and draw a failure takes about as long as to simulate so much."""
 _MOST_S: Final = 600.0
 """So many seconds are simulated again in all."""
+WITHIN_S: Final = 150.0
+"""Of an episode failures later than this are not shown where an earlier one is: to come there takes long."""
 _ENOUGH_ALIKE: Final = 30
 """Of failures with the same facets so many are looked at, the earliest."""
 _OF_AN_EPISODE: Final = 40
@@ -59,15 +61,21 @@ def shown_of(runs: Sequence[ReportedRun]) -> list[FailureToShow]:
     return found
 
 
-def most_telling(candidates: Sequence[FailureToShow], most: int = MOST_FAILURES) -> list[FailureToShow]:
+def most_telling(
+    candidates: Sequence[FailureToShow], most: int = MOST_FAILURES, within_s: float = WITHIN_S
+) -> list[FailureToShow]:
     """The most telling ones, the most telling first: each adds as many facets as it can for the time that it takes to
     come there, then a new episode and a new place. Stops when there is nothing new, but not below LEAST_FAILURES; what
-    would take longer than _MOST_S in all is left out."""
+    would take longer than _MOST_S in all is left out, and so are failures later than within_s of their episode, but
+    for its first."""
     alike: Counter[frozenset[Hashable]] = Counter()
     left: list[FailureToShow] = []
+    begun: set[tuple[int, str]] = set()
     for one in sorted(candidates, key=lambda one: (one.mishap.tick, one.scenario, one.run)):
-        alike[one.facets] += 1
-        if alike[one.facets] <= _ENOUGH_ALIKE:
+        soon = (one.run, one.scenario) not in begun or Clock().time_s(one.mishap.tick) <= within_s
+        begun.add((one.run, one.scenario))
+        alike[one.facets] += soon
+        if soon and alike[one.facets] <= _ENOUGH_ALIKE:
             left.append(one)
     choice = _Choice()
     while left and len(choice.picked) < most:

@@ -131,8 +131,8 @@ def _gallery(entries: Sequence[Entry], note: str) -> str:
     cards = "".join(_card(number, entry) for number, entry in enumerate(entries))
     intro = (
         f"{len(entries)} failures, chosen so that every run, structure, event and cause is there, and every real place "
-        "that was driven, as far as there is room. Open one to see its last seconds again: from above, by the robot's "
-        "camera, from behind."
+        "that was driven, as far as there is room; of a long episode its first failure, and others that come soon. "
+        "Open one to see its last seconds again: from above, by the robot's camera, from behind."
     )
     said = f'<p class="warn">{escape(note)}</p>' if note else ""
     return (

@@ -1,0 +1,74 @@
+"""Failures shown again: one replay for all of an episode, held against its record, each picture drawn once."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from cosim.core.errors import RunError, UsageError
+from cosim.report.page.reasons import mishaps_of
+from physics.cameras.eyes import WorldCamera
+from scenarios.execution.replay import recorded, replaying
+from scenarios.viewing.scenes import show_again, ticks_to_show
+from tests.conftest import Cosim
+
+pytestmark = pytest.mark.engine
+NAME = "obstructing-001"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory, cosim: Cosim) -> Path:
+    """A run of a scenario that a blind policy fails."""
+    folder = tmp_path_factory.mktemp("scenes")
+    words = ("--policy", "tests.report.blind:Blind", "--scenario", NAME, "--out", "run")
+    done = cosim("run", "reactive", *words, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return folder / "run"
+
+
+def test_failures_that_follow_one_another_share_their_pictures(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The failure and, as if there were one, a moment a second before it: each has its last 5 s, four a second, and the
+    moment itself; what both show is drawn once, and is the same. What is done rises to what was announced."""
+    drawn, done = [], []
+    render = WorldCamera.render
+    monkeypatch.setattr(WorldCamera, "render", lambda *told: drawn.append(0) or render(*told))
+    (last,) = mishaps_of(recorded(run, NAME).record)
+    before = last._replace(tick=last.tick - 20, failure=None)
+    shown = show_again(run, NAME, [last, before], "auto", done.append)
+    late, early = (one.scene.pictures for one in shown)
+    seen = {*late.follow, *early.follow}
+    assert len(late.follow) in (20, 21) and len(early.follow) in (20, 21) and len(seen) == len(drawn) <= 27
+    assert len({*late.follow} & {*early.follow}) >= 15 and late.at[-1] == len(shown[0].scene.robot) // 6 - 1
+    assert done == sorted(done) and done[-1] == ticks_to_show([last, before])
+
+
+@pytest.mark.parametrize("column", ["pose", "person_m"])
+def test_an_episode_that_comes_out_otherwise_is_not_shown(run: Path, column: str) -> None:
+    """One bit of one tick before the failure: an error that names the moment."""
+    path = run / "episodes" / NAME / "trajectory.npz"
+    kept = path.read_bytes()
+    with np.load(path) as arrays:
+        held = dict(arrays)
+    held[column] = held[column].copy()
+    held[column][5] = np.nextafter(held[column][5], 9e9)
+    np.savez(path, **held)
+    try:
+        with pytest.raises(RunError, match=r"not the same when it was replayed \(from 0.25 s on\)"):
+            show_again(run, NAME, mishaps_of(recorded(run, NAME).record), "auto")
+    finally:
+        path.write_bytes(kept)
+
+
+def test_a_replay_that_is_judged_alone_has_no_result(run: Path) -> None:
+    """It ends when the recorded one did; what was measured in it is not to be had."""
+    told = recorded(run, NAME)
+    episode, policy = replaying(told, judged_alone=True)
+    with episode:
+        observation = episode.reset()
+        while not episode.over:
+            observation = episode.advance(policy.act(observation))
+        assert episode.moment.tick == told.record.ticks
+    with pytest.raises(UsageError, match="judged alone"):
+        episode.result()
