@@ -186,6 +186,8 @@ def _from_net(work: ImportWork, options: Options) -> Converted:
     if options.as_is:
         return _unchanged(work, net, facts)
     share: float | None = None
+    if options.sidewalk_width_m is not None and not _lacks_walkways(facts):
+        changes.append("--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed")
     if _lacks_walkways(facts):
         net = add_walkways(work, net, facts)
         net = widen_sidewalks(work, net, options.widths_m, {}, before)

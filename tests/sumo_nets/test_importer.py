@@ -159,7 +159,7 @@ def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
     source = tmp_path / "good.net.xml.gz"
     source.write_bytes(gzip.compress(small_city()))
     before = read_net(source)
-    about = import_map(source)
+    about = import_map(source, options=Options(sidewalk_width_m=3.0))
     after = read_map("good")
     for a, b in zip(after.strips.values(), before.strips.values(), strict=True):
         assert (a.id, a.kind, a.corners, a.signalised, a.crosses) == (b.id, b.kind, b.corners, b.signalised, b.crosses)
@@ -167,6 +167,7 @@ def test_a_good_net_is_kept_as_it_is(tmp_path: Path) -> None:
         assert a.polygon.equals(b.polygon)
     assert [(c.id, c.ports) for c in after.corners.values()] == [(c.id, c.ports) for c in before.corners.values()]
     assert about.guessed_share is None and about.changes[0] == "unpacked (gzip)"
+    assert "--sidewalk-width has no effect: the net has sidewalks of its own, none is guessed" in about.changes
 
 
 @pytest.mark.engine
