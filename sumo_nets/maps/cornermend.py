@@ -34,7 +34,7 @@ def mend_corners(root: ET.Element, street_map: StreetMap, tell: Tell = untold) -
     for number, corner in enumerate(street_map.corners.values()):
         if number % 100 == 0:
             tell("mending corners", number / len(street_map.corners))
-        polygon = passable(street_map, corner)
+        polygon = widened_corner(street_map, corner)
         if polygon is not None and corner.id in lanes:
             ring = shapely.get_coordinates(polygon.exterior)[:-1]
             lanes[corner.id].set("shape", " ".join(f"{x:.2f},{y:.2f}" for x, y in ring))
@@ -44,7 +44,7 @@ def mend_corners(root: ET.Element, street_map: StreetMap, tell: Tell = untold) -
     return [f"{mended} of {len(street_map.corners)} corners were torn or pinched: widened along the ways across them"]
 
 
-def passable(street_map: StreetMap, corner: Corner) -> Polygon | None:
+def widened_corner(street_map: StreetMap, corner: Corner) -> Polygon | None:
     """The corner's polygon, widened by pads at its ports and bands between them; None when all is well as it is."""
     ports = list(dict.fromkeys(corner.ports))
     if len(ports) < 2:
