@@ -42,9 +42,15 @@ def check_database(path: Path) -> None:
 
 
 def records_in(database: sqlite3.Connection) -> list[Record]:
-    """All records, in the order in which their episodes ended."""
-    rows: Sequence[tuple[str]] = database.execute("select record from episodes order by rowid").fetchall()
-    return [msgspec.json.decode(text, type=Record) for (text,) in rows]
+    """All records, in the order in which their episodes ended. Raises sqlite3.Error, DecodeError."""
+    rows: Sequence[tuple[object]] = database.execute("select record from episodes order by rowid").fetchall()
+    return [msgspec.json.decode(_text(value), type=Record) for (value,) in rows]
+
+
+def _text(value: object) -> str:
+    if not isinstance(value, str):
+        raise msgspec.DecodeError("a row holds no text")
+    return value
 
 
 def is_damaged(error: sqlite3.Error) -> bool:

@@ -319,8 +319,8 @@ def read_rows(path: Path) -> dict[str, dict[str, Any]]:
     try:
         with closing(connected(path)) as database:
             rows = database.execute("select scenario, row from episodes").fetchall()
-        return {scenario: json.loads(row) for scenario, row in rows}
-    except json.JSONDecodeError as error:
+        return {scenario: dict(json.loads(row)) for scenario, row in rows}
+    except (TypeError, ValueError) as error:
         raise damaged(path, error) from error
     except sqlite3.Error as error:
         raise trouble_with(path, error) from error

@@ -20,7 +20,7 @@ from cosim.episode.ports import CameraSpec, WaypointRule
 from cosim.judge.metrics import METRICS
 from cosim.records.record import Record
 from cosim.records.results import summary_of, table_of, table_row
-from cosim.records.run_folder import RunFolder, read_records, read_spec
+from cosim.records.run_folder import RunFolder, read_records, read_rows, read_spec
 from cosim.records.run_spec import RunSpec
 from cosim.spec.scenario import City, Scenario, Suite
 from tests.conftest import Cosim
@@ -219,7 +219,12 @@ def odd_rows(database: Path) -> None:
         connection.execute("update episodes set record = '{'")
 
 
-DAMAGES = {damage.__name__: damage for damage in (garbage, cut_off, overwritten, another_table, odd_rows)}
+def null_rows(database: Path) -> None:
+    with closing(sqlite3.connect(database)) as connection, connection:
+        connection.execute("update episodes set record = null, row = x'00'")
+
+
+DAMAGES = {damage.__name__: damage for damage in (garbage, cut_off, overwritten, another_table, odd_rows, null_rows)}
 
 
 @pytest.mark.parametrize("name", DAMAGES)
@@ -232,6 +237,9 @@ def test_a_damaged_database_is_made_anew_from_the_records(tmp_path: Path, name: 
     DAMAGES[name](tmp_path / "run/results.sqlite")
     with pytest.raises(RunError, match=r"results\.sqlite is damaged .*--resume, which makes it anew"):
         read_records(tmp_path / "run")
+    if name != "odd_rows":
+        with pytest.raises(RunError, match=r"results\.sqlite is damaged"):
+            read_rows(tmp_path / "run")
     with RunFolder.resume(tmp_path / "run", SPEC) as again:
         assert again.finished() == {"s-0", "s-2"}
         (note,) = again.notes
