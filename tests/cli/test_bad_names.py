@@ -12,39 +12,25 @@ LONG = "a" * 300
 RUN = ("run", "reactive", "--policy", "straight", "--scenario", "obstructing-001")
 WRITES: tuple[tuple[str, ...], ...] = (
     (*RUN, "--out", LONG),
-    (*RUN, "--rerun", f"{LONG}.rrd"),
-    (*RUN, "--log-json", LONG),
-    ("coordinator", "reactive", "--policy", "straight", "--episodes", "1", "--out", LONG),
+    ("coordinator", "reactive", "--policy", "straight", "--episodes", "1", "--log-json", LONG),
     ("collect", "reactive", "--out", LONG, "--episodes", "1"),
-    ("scenario", "run", "mine.toml", "--policy", "straight", "--out", LONG),
-    ("scenario", "new", f"{LONG}.toml"),
     ("scenario", "draw", "mine.toml", "-o", f"{LONG}.png"),
     ("suite", "build", "unit", f"{LONG}.json", "--only", "straight-001"),
     ("city", "make", "--seed", "1", "--size", "300", LONG),
-    ("city", "draw", "1", "--size", "300", "-o", f"{LONG}.png"),
     ("map", "check", "sumo-fkk-in", "-o", f"{LONG}.png"),
-    ("look", "obstructing-001", "-o", f"{LONG}.png"),
     ("film", "run", "obstructing-001", "-o", f"{LONG}.mp4"),
     ("report", "run", "-o", f"{LONG}.html"),
     ("export", "obstructing-001", f"{LONG}.glb"),
-    ("show", "run", "--episode", "obstructing-001", "-o", f"{LONG}.png"),
     ("compare", "run", "run", "-o", f"{LONG}.csv"),
-    ("merge", "run", "run", "--out", LONG),
-    ("dataset", "pack", "demos", "-o", f"{LONG}.npz"),
     ("train", "demos.npz", "-o", LONG),
-    ("policy", "check", "straight", "-o", f"{LONG}.png", "--only", "finite"),
     ("certs", "init", LONG),
 )
 READS: tuple[tuple[str, ...], ...] = (
     ("show", LONG),
-    ("score", LONG),
     ("run", LONG),
     ("run", "reactive", "--policy", f"onnx:{LONG}"),
-    ("run", "reactive", "--map", LONG),
     ("map", "import", LONG),
     ("scenario", "check", LONG),
-    ("certs", "role", LONG, "viewer"),
-    ("status", LONG),
 )
 
 
@@ -62,11 +48,8 @@ FOLDERS: tuple[tuple[str, ...], ...] = (
     ("certs", "init", "file"),
     ("certs", "role", "file", "viewer"),
     ("certs", "show", "file"),
-    (*RUN, "--out", "file"),
     ("collect", "reactive", "--out", "file", "--episodes", "1"),
     ("city", "make", "--seed", "1", "--size", "300", "file"),
-    ("merge", "file", "file", "--out", "file"),
-    ("show", "file"),
     ("score", "file/below"),
 )
 

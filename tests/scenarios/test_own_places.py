@@ -26,8 +26,10 @@ OTHERS: dict[str, bytes] = {
 }
 
 
-@pytest.mark.parametrize("ending", ["", ".net.xml", ".osm"], ids=["no-ending", "net", "osm"])
-@pytest.mark.parametrize("name", OTHERS)
+@pytest.mark.parametrize(
+    ("name", "ending"),
+    [*((name, "") for name in OTHERS), ("text", ".net.xml"), ("xml", ".net.xml"), ("packed", ".osm")],
+)
 def test_of_a_file_that_is_no_map_nothing_is_printed(tmp_path: Path, cosim: Cosim, name: str, ending: str) -> None:
     """Text, other XML, packed data: it is said that it is no map, with its path and no byte of it."""
     (tmp_path / f"other{ending}").write_bytes(OTHERS[name])
