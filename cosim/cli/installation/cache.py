@@ -12,6 +12,7 @@ from rich import box
 from rich.table import Column, Table
 
 from cosim.cli.terminal.consoles import out
+from cosim.cli.terminal.fitted import print_fitted
 from cosim.core.cache import (
     CACHE_KINDS,
     GB,
@@ -76,7 +77,7 @@ def _print_sizes(entries: Sequence[CacheEntry]) -> None:
         used = f"{duration(time.time() - max(e.used_s for e in of_it))} ago" if of_it and not kind.stays else ""
         words = f"{kind.words}; never removed" if kind.stays else kind.words
         shown.add_row(kind.name, str(len(of_it)), bytes_in_words(sum(e.size_bytes for e in of_it)), used, words)
-    out.print(shown)
+    print_fitted(out, shown, words=(4,))
 
 
 def _counted(entries: int) -> str:
