@@ -9,7 +9,6 @@ OUT/meta, data, videos   the data set; meta comes last: with it, it is whole
 
 from __future__ import annotations
 
-import importlib.util
 import shutil
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -21,7 +20,7 @@ from typing import Any, Final
 
 import msgspec
 
-from cosim.core.errors import MachineError, RunError, SpecError, unwritable
+from cosim.core.errors import RunError, SpecError, unwritable
 from cosim.core.telling import Tell, untold
 from cosim.core.versions import versions
 from cosim.core.whole_file import write_whole
@@ -35,7 +34,7 @@ from cosim.spec.options import EpisodeOptions
 from cosim.spec.scenario import City, Scenario, Suite, read_suite
 from scenarios.builders.fits import check_places
 from scenarios.catalog import with_robot
-from scenarios.collecting.demonstration import Demonstration
+from scenarios.collecting.demonstration import Demonstration, check_parquet
 from scenarios.collecting.demonstrator import Demonstrator, learner_of
 from scenarios.collecting.fresh import Fresh
 from scenarios.collecting.lerobot import Collected, Filmed, write_lerobot
@@ -111,12 +110,6 @@ class Gathered:
 
 _Showing = Callable[[Sequence[Scenario], set[str]], AbstractContextManager[Hear]]
 """Shows how a run goes: of these scenarios, of which some are done."""
-
-
-def check_parquet() -> None:
-    """Raises MachineError where the package is missing that writes and reads data sets."""
-    if importlib.util.find_spec("pyarrow") is None:
-        raise MachineError("a data set needs pyarrow, of the extra [collect]: pip install 'sidewalk-cosim[collect]'")
 
 
 def _unshown(scenarios: Sequence[Scenario], done: set[str]) -> AbstractContextManager[Hear]:

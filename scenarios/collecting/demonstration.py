@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from dataclasses import dataclass, fields
 from typing import Final
@@ -10,12 +11,18 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from cosim.core.errors import RunError
+from cosim.core.errors import MachineError, RunError
 from cosim.core.geometry import Floats
 from cosim.core.npz import arrays_in
 
 _GLIMPSE_PX: Final = (8, 6)
 _STRAIGHT_RADPS: Final = 1e-6
+
+
+def check_parquet() -> None:
+    """Check that pyarrow, which writes and reads data sets, is installed. Raises MachineError."""
+    if importlib.util.find_spec("pyarrow") is None:
+        raise MachineError("a data set needs pyarrow, of the extra [collect]: .venv/bin/pip install 'pyarrow<24'")
 
 
 @dataclass(frozen=True)

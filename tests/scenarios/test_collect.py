@@ -346,3 +346,24 @@ def test_the_lerobot_package_reads_a_data_set(desk: Desk, packed: Packed) -> Non
         np.testing.assert_array_equal(one["action"].numpy(), packed.command[row])
         picture = 255.0 * one["observation.images.front"].numpy().transpose(1, 2, 0)
         assert np.abs(picture - packed.frames[row]).mean() < 2.0
+
+
+@pytest.mark.parametrize(
+    "words", [("collect", "reactive", "--episodes", "1", "--out", "d"), ("dataset", "pack", "demos", "-o", "d.npz")]
+)
+def test_a_data_set_without_pyarrow_is_refused_in_one_line(tmp_path: Path, words: tuple[str, ...]) -> None:
+    """The error names the package and the command that installs it; exit code 3, no traceback."""
+    code = (
+        "import sys, importlib.util\nfound = importlib.util.find_spec\n"
+        "importlib.util.find_spec = lambda name, *rest: None if name == 'pyarrow' else found(name, *rest)\n"
+        "sys.modules['pyarrow'] = None\nfrom cosim.__main__ import main\nsys.exit(main())"
+    )
+    command = [sys.executable, "-c", code, *words]
+    done = subprocess.run(
+        command,
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 3 and "pip install 'pyarrow<24'" in done.stderr and "Traceback" not in done.stderr, done

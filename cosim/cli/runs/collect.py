@@ -95,10 +95,12 @@ def collect_command(
     from cosim.spec.goal import goal_called
     from cosim.spec.options import EpisodeOptions
     from cosim.spec.policy_host import PolicyHost
-    from scenarios.collecting.collect import check_parquet, collect
+    from scenarios.collecting.demonstration import check_parquet
+
+    check_parquet()  # before the modules that import pyarrow
+    from scenarios.collecting.collect import collect
     from scenarios.serving.drivers import known_driver
 
-    check_parquet()
     wide, high = size_called("--camera", size)
     spec = CameraSpec(width=wide, height=high, fov_deg=fov, mount=mount)
     collecting = Collecting(

@@ -31,7 +31,7 @@ def pack(
 
     The arrays are told in `cosim/core/packed.py`; `cosim.core.packed.read_packed` reads them.
     """
-    from scenarios.collecting.collect import check_parquet
+    from scenarios.collecting.demonstration import check_parquet
 
     check_parquet()
     check_output(output, "packed arrays", (".npz",))
