@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 import pandas as pd
 
 from cosim.core.errors import MachineError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 _TITLES: Final = {
     "success": "success (SR)",
@@ -24,6 +28,11 @@ _COLOURS: Final = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f
 _MARKS: Final = "osD^v<>P"
 _MOST_NAMED: Final = 16
 """Of more lines than this none is named."""
+_PANEL_LETTERS, _PANEL_LINES, _UPRIGHT_LETTERS, _TITLE_LETTERS, _LEGEND_LETTERS = 44, 24, 26, 120, 168
+"""Letters that fit side by side below a panel; lines that fit there upright, and the letters of each; letters that fit
+above all panels, and below them."""
+_LOW, _HIGH = 7.4, 10.4
+"""The figure's height in inches, with names side by side and with upright ones."""
 _APART: Final = 0.012
 """Lines stand so far beside each other, of the width of a panel, so that their intervals can be told apart."""
 
@@ -42,7 +51,9 @@ def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[
     along, ticks = _places(summary[first])
     whole = summary.assign(_along=along)
     lines = list(whole.groupby(others, sort=False)) if others else [((), whole)]
-    figure = Figure(figsize=(13.0, 7.4), dpi=120, layout="constrained")
+    figure = Figure(
+        figsize=(13.0, _LOW if ticks is None or _side_by_side(ticks) else _HIGH), dpi=120, layout="constrained"
+    )
     FigureCanvasAgg(figure)
     for panel, metric in zip(figure.subplots(2, -(-len(metrics) // 2)).flat, metrics, strict=True):
         shift = _APART * (float(np.ptp(along)) or 1.0)
@@ -57,18 +68,35 @@ def draw_curves(summary: pd.DataFrame, fields: Sequence[str], metrics: Sequence[
         panel.set_xlabel(first)
         panel.grid(alpha=0.3)
         if ticks is not None:
-            panel.set_xticks(range(len(ticks)), ticks)
+            _name_ticks(panel, ticks)
         if metric in _SHARES:
             panel.set_ylim(-0.03, 1.03)
         else:
             panel.set_ylim(bottom=0.0)
     if others and len(lines) <= _MOST_NAMED:
         handles, names = figure.axes[0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4), fontsize=9)
-    figure.suptitle(f"{title}: means with 95 % intervals", fontsize=12)
+        columns = min(len(names), 4, max(1, _LEGEND_LETTERS // (6 + max(map(len, names)))))
+        figure.legend(handles, names, loc="outside lower center", ncols=columns, fontsize=9)
+    figure.suptitle(textwrap.fill(f"{title}: means with 95 % intervals", _TITLE_LETTERS), fontsize=12)
     picture = io.BytesIO()
     figure.savefig(picture, format="png")
     return picture.getvalue()
+
+
+def _name_ticks(panel: Axes, names: Sequence[str]) -> None:
+    """Name places along a panel: side by side where there is room, else upright, folded, of many every second or so."""
+    if _side_by_side(names):
+        panel.set_xticks(range(len(names)), names)
+        return
+    folded = [textwrap.fill(name, _UPRIGHT_LETTERS) for name in names]
+    lines = max(name.count("\n") + 1 for name in folded)
+    every = -(-len(names) * lines // _PANEL_LINES)
+    panel.set_xticks(range(0, len(names), every), folded[::every], rotation=90, fontsize=9)
+
+
+def _side_by_side(names: Sequence[str]) -> bool:
+    """Return whether names fit side by side below a panel."""
+    return sum(map(len, names)) + 2 * len(names) <= _PANEL_LETTERS
 
 
 def _places(values: pd.Series[Any]) -> tuple[np.ndarray, list[str] | None]:

@@ -12,8 +12,15 @@ import numpy as np
 import pytest
 
 from cosim.cli.terminal import progress
+from cosim.report.page.page import Maps, colours_of, counts_of, page_of
+from cosim.report.page.plots import plots_of
+from cosim.report.page.reasons import CAUSES
+from cosim.report.page.runs import read_runs
+from cosim.report.page.scene import PlacePicture, Spot
+from cosim.spec.scenario import City
 from tests.chromium import CHROMIUM, Page, chromium
 from tests.conftest import Cosim
+from tests.records.driven_runs import HIT, run_of, short_way
 from tests.report.blind import BEND
 
 pytestmark = [
@@ -25,6 +32,20 @@ PICTURED = (
 )
 DRAWN = "document.querySelector('#above').toDataURL()"
 WIDE = "document.documentElement.scrollWidth"
+PIXEL = "data:image/gif;base64,R0lGODlhAQABAIAAAAAAAP///yH5BAEAAAAALAAAAAABAAEAAAIBRAA7"
+CUT_OFF = """[...document.querySelectorAll('.drawing')].flatMap((plot) => {
+  const box = (one) => one.getBoundingClientRect(), all = box(plot);
+  const within = ({ left, right, top, bottom }) => left > all.left - 1 && right < all.right + 1
+    && top > all.top - 1 && bottom < all.bottom + 1;
+  const wide = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left);
+  const high = (a, b) => Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top);
+  const texts = [...plot.querySelectorAll('.main-svg text')].filter((t) => t.textContent.trim() && box(t).width);
+  const still = texts.filter((t) => !t.closest('.hoverlayer'));
+  const covers = (a, b) => wide(box(a), box(b)) > 2 && high(box(a), box(b)) > 3;
+  const covered = still.filter((a, k) => still.slice(0, k).some((b) => covers(a, b)));
+  return [...texts.filter((t) => !within(box(t))), ...covered].map((t) => t.textContent);
+})"""
+"""The texts of plots that are not whole in their plot, or lie on another."""
 
 
 @pytest.fixture(scope="module")
@@ -138,6 +159,51 @@ def test_a_phone_and_paper_show_all_of_it(page: Page) -> None:
     page.key("Escape", code=27)
     printed = base64.b64decode(page.call("Page.printToPDF", printBackground=True)["data"])
     assert printed.startswith(b"%PDF") and len(printed) > 20_000
+
+
+@pytest.fixture(scope="module")
+def crowded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A page of six runs of policies with long names, in scenarios with long names; nothing is shown again."""
+    folder, rng = tmp_path_factory.mktemp("crowded"), np.random.default_rng(1)
+    kinds = ["straight", "curve", "crosswalk"]
+    ways = [short_way(f"way-{k}", structure=kinds[k % 3], place=City(seed=k % 2)) for k in range(9)]
+    ways += [short_way(f"long-{k}", ends_on_failure=False, time_limit_s=300.0, structure="route") for k in range(4)]
+    names = ["x" * 70, *(f"a-rather-long-policy-name-{k}-2026-11-24" for k in range(5))]
+    hows = [[*rng.choice(["goal", HIT, "crashed"], 9).tolist(), *["goal"] * 3, HIT] for _ in names]
+    runs = read_runs([run_of(folder / f"run-{k}", hows[k], name, ways) for k, name in enumerate(names)])
+    spots = {
+        place: [Spot(x_m=9.0 * k, y_m=5.0, cause=CAUSES[k % 5], words=f"way-{k} ({name}), 12.3 s: drove into <a wall>")]
+        for place in counts_of(runs)
+        for k, name in enumerate(names)
+    }
+    pictures = [PlacePicture(place=one, image=PIXEL, bounds=(0.0, 0.0, 50.0, 9.0)) for one in spots]
+    maps = Maps(pictures, spots, dict(counts_of(runs)))
+    path = folder / "crowded.html"
+    path.write_bytes(page_of(runs, plots_of(runs, colours_of(runs)), [], maps, "nothing was shown again"))
+    return path
+
+
+def test_no_text_is_cut_off_or_covered(crowded: Path, browser: Page) -> None:
+    """At 1280 px, then at 400: every text of every plot lies in its plot, none on another, the figures that show when a
+    point is touched too; of a table the names leave more than half of the width to the figures."""
+    browser.size(1280, 900)
+    browser.open(crowded)
+    plots = "[...document.querySelectorAll('.drawing')]"
+    for wide in (1280, 400):
+        browser.size(wide, 900, phone=wide == 400)
+        browser.until(f"innerWidth === {wide}")
+        browser.until(f"{plots}.every((p) => !p.dataset.plot || p.dataset.wide === String(p.clientWidth))")
+        browser.until(f"{plots}.every((p) => p.querySelector('.main-svg')?.clientWidth === p.clientWidth)")
+        assert browser.js(CUT_OFF) == [] and browser.js(WIDE) <= wide
+        assert browser.js(f"{plots}.length") == 4
+        for number in range(4):
+            browser.js(f"Plotly.Fx.hover({plots}[{number}], [{{curveNumber: 0, pointNumber: 0}}])")
+            browser.until(f"{plots}[{number}].querySelectorAll('.hovertext').length > 0")
+            assert browser.js(CUT_OFF) == []
+            browser.js(f"Plotly.Fx.unhover({plots}[{number}])")
+        names = "[...document.querySelectorAll('.wide th[scope=row]')].map((head) => head.offsetWidth)"
+        assert browser.js(f"Math.max(...{names})") < 0.5 * wide
+    assert browser.wrong == []
 
 
 def test_plots_and_maps_are_drawn(page: Page) -> None:

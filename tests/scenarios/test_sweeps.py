@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -13,9 +15,11 @@ import pytest
 from cosim.core.errors import MachineError
 from cosim.judge.metrics import METRICS
 from cosim.records.results import summary_of
+from cosim.report.curves import draw_curves
 from scenarios.own.reading import OwnFile, read_own
 from scenarios.own.sweep import summary_of_sweep, write_sweep
 from tests.conftest import ROOT, Cosim
+from tests.drawn_text import clipped_texts
 
 EXAMPLES = ROOT / "scenarios" / "examples"
 SHORTER = {
@@ -69,6 +73,30 @@ def test_a_sweep_is_written_whole_or_not_at_all(
     with pytest.raises(MachineError, match="matplotlib is missing: `pip install matplotlib`"):
         write_sweep(summary, own, tmp_path / "bare")
     assert [path.name for path in (tmp_path / "bare").iterdir()] == ["sweep.csv"]
+
+
+LONG = [f"a-map-with-quite-a-long-name-{k}" for k in range(12)]
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"crowd.density": [0, 10]},
+        {"place.map": LONG},
+        {"light.hour": [f"hour {k}" for k in range(60)]},
+        {"crowd.density": [0, 10], "place.map": LONG, "robot": ["courier"]},
+    ],
+    ids=["numbers", "long names", "many names", "long lines"],
+)
+def test_nothing_of_a_sweeps_picture_is_cut_off(monkeypatch: pytest.MonkeyPatch, fields: dict[str, list[Any]]) -> None:
+    """No name of a value, a field, a line or the file is outside of the picture, or on another."""
+    metrics = ("success", "failures_per_100m", "time_to_goal_s")
+    rows = [
+        dict(zip(fields, at, strict=True)) | {"metric": metric, "mean": 0.5, "low": 0.2, "high": 0.7, "n": 3}
+        for at in itertools.product(*fields.values())
+        for metric in metrics
+    ]
+    assert clipped_texts(monkeypatch, lambda: draw_curves(pd.DataFrame(rows), [*fields], metrics * 2, "x" * 150)) == []
 
 
 def test_words_and_several_fields_are_drawn(tmp_path: Path) -> None:

@@ -14,14 +14,42 @@
   };
   const axis = { gridcolor: "#e9ecee", automargin: true, fixedrange: true, title: { standoff: 8 } };
   const config = { responsive: true, displayModeBar: false };
-  for (const place of all("[data-plot]")) {
-    const { data: traces, layout } = data.plots[Number(place.dataset.plot)];
+  // Names are folded to the width that there is, and a plot is as high as its folded names need.
+  function plot(place) {
+    const { data: traces, layout } = data.plots[Number(place.dataset.plot)], wide = place.clientWidth;
+    const rows = [...new Set(layout.yaxis.categoryarray || traces.flatMap((t) => t.y))];
+    const names = rows.map((row) => folded(row, Math.max(10, Math.floor(0.36 * wide / LETTER))));
+    const beside = Math.floor(wide / LETTER) - Math.max(...names.map(longest)) - 8;
+    const keys = traces.map((t) => folded(t.name, Math.max(10, beside)));
+    const taller = Math.max(0, LINE * Math.max(...names.map(lines)) + 8 - layout.meta.row) * rows.length;
+    const inARow = Math.max(1, Math.floor((beside * LETTER) / (LETTER * Math.max(...keys.map(longest)) + 50)));
+    const legend = layout.showlegend ? LINE * (Math.ceil(keys.length / inARow) * Math.max(...keys.map(lines)) - 1) : 0;
     const xaxis = { ...axis, ...layout.xaxis, title: { ...axis.title, ...(layout.xaxis.title || {}) } };
-    const shown = { ...base, ...layout, xaxis, yaxis: { ...axis, ticks: "outside", ticklen: 6, tickcolor: "#fff", ...layout.yaxis } };
-    Plotly.newPlot(place, traces.map((t) => ({ ...t, hovertemplate: `${t.hovertemplate}<extra>${t.name}</extra>` })), shown, config);
+    const yaxis = { ...axis, ticks: "outside", ticklen: 6, tickcolor: "#fff", ...layout.yaxis, tickvals: rows, ticktext: names };
+    const shown = { ...base, ...layout, height: layout.height + taller + legend, xaxis, yaxis };
+    const hover = (t) => `${t.hovertemplate}<br>${folded(t.name, HOVER)}<extra></extra>`;
+    const drawn = Plotly.react(place, traces.map((t, k) => ({ ...t, name: keys[k], hovertemplate: hover(t) })), shown, config);
+    drawn.then(() => { place.dataset.wide = wide; });
   }
+  const LETTER = 7.4, LINE = 19, HOVER = 32;
+  const lines = (text) => text.split("<br>").length;
+  const longest = (text) => Math.max(...text.split("<br>").map((line) => raw(line).length));
+  all("[data-plot]").forEach(plot);
   // Plotly reads a few tags in its texts; names are to be seen as they are.
   function plain(text) { return String(text).replace(/&/g, "&amp;").replace(/</g, "&lt;").replace(/>/g, "&gt;"); }
+  function raw(text) { const reader = document.createElement("textarea"); reader.innerHTML = text; return reader.value; }
+  // A text of Plotly's in lines of so many letters, broken after what is no letter where that can be.
+  function folded(text, letters) {
+    return text.split("<br>").map((part) => {
+      const folds = [""];
+      for (let word of raw(part).split(/(?<=[^\p{L}\p{N}])/u)) {
+        if (folds.at(-1) && (folds.at(-1) + word).trimEnd().length > letters) folds.push("");
+        for (; word.length > letters; word = word.slice(letters)) folds.splice(-1, 1, folds.at(-1) + word.slice(0, letters), "");
+        folds[folds.length - 1] += word;
+      }
+      return folds.filter((line) => line.trim()).map((line) => plain(line.trimEnd())).join("<br>");
+    }).join("<br>");
+  }
 
   // The part that is read is marked in the navigation
   const links = new Map(all("nav a").map((a) => [a.hash.slice(1), a]));
@@ -250,7 +278,7 @@
     const traces = causes.map((cause) => {
       const of = spots.filter((s) => s.cause === cause);
       return { type: "scatter", mode: "markers", name: cause, x: of.map((s) => s.x_m), y: of.map((s) => s.y_m),
-        text: of.map((s) => plain(s.words)), customdata: of.map((s) => s.entry), hovertemplate: "%{text}<extra></extra>",
+        text: of.map((s) => folded(plain(s.words), HOVER)), customdata: of.map((s) => s.entry), hovertemplate: "%{text}<extra></extra>",
         marker: { opacity: 1, size: of.map((s) => (s.entry < 0 ? 9 : 15)), color: data.causes[cause], line: { color: "#fff", width: 1.5 } } };
     });
     const width = one("#map").clientWidth, height = Math.max(160, Math.min(width * (y1 - y0) / (x1 - x0), 760)) + 40;
@@ -265,9 +293,14 @@
   if (chooser) {
     map().then((drawing) => drawing.on("plotly_click", ({ points }) => { if (points[0].customdata >= 0) open(points[0].customdata); }));
     chooser.addEventListener("change", map);
-    let width = innerWidth, later = 0;
-    addEventListener("resize", () => { if (innerWidth !== width) { width = innerWidth; clearTimeout(later); later = setTimeout(map, 150); } });
   }
+  let width = innerWidth, later = 0;
+  addEventListener("resize", () => {
+    if (innerWidth === width) return;
+    width = innerWidth;
+    clearTimeout(later);
+    later = setTimeout(() => { all("[data-plot]").forEach(plot); if (chooser) map(); }, 150);
+  });
   addEventListener("beforeprint", () => all("[data-plot]").forEach((p) => Plotly.Plots.resize(p)));
   document.documentElement.dataset.ready = "true";
 })();

@@ -24,6 +24,8 @@ from cosim.report.page.three_tables import summary_html, tables_html, warnings_h
 
 _POLICY: Final = "default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
 """What the page may load: nothing from outside."""
+_MOST_LISTED: Final = 4
+"""Of more runs than this the heading names fewer."""
 _MOST_TOLD: Final = 12
 """Of crashed and invalid episodes of a run so many are told by name."""
 
@@ -107,6 +109,8 @@ def _lede(runs: Sequence[ReportedRun]) -> str:
 
 
 def _listed(words: Sequence[str]) -> str:
+    if len(words) > _MOST_LISTED:
+        words = [*words[: _MOST_LISTED - 1], f"{len(words) - _MOST_LISTED + 1} more"]
     return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
 
 

@@ -33,6 +33,7 @@ _SPEED_EDGES: Final = (0.25, 0.75, 1.25, 1.75)
 _SPEED_WORDS: Final = ("below 0.25", "0.25 to 0.75", "0.75 to 1.25", "1.25 to 1.75", "above 1.75")
 _LEAST_M: Final = 20.0
 """Of fewer metres travelled no rate is shown."""
+_BAR_PX: Final = 40
 _FAMILIES: Final[Mapping[PaperTable, str]] = {
     "unit": "unit tests",
     "reactive": "people in the way",
@@ -185,7 +186,8 @@ def _points(
                 },
                 "marker": {"size": 9, "color": colours[label]},
                 "customdata": [[round(cell.low, 3), round(cell.high, 3), cell.n] for _, cell in shown],
-                "hovertemplate": "%{y}: %{x:.2f} (%{customdata[0]:.2f} to %{customdata[1]:.2f}), n = %{customdata[2]}",
+                "hovertemplate": "%{y}<br>%{x:.2f} (%{customdata[0]:.2f} to %{customdata[1]:.2f}),"
+                " n = %{customdata[2]}",
             }
         )  # fmt: skip
     scale = {"range": [-0.02, 1.02], "tickformat": ".1f"} if share else {"rangemode": "tozero"}
@@ -193,6 +195,7 @@ def _points(
         "data": data,
         "layout": {
             "height": 96 + len(words) * (16 + 15 * len(cells)),
+            "meta": {"row": 16 + 15 * len(cells)},
             "scattermode": "group",
             "showlegend": len(cells) > 1,
             "xaxis": {"title": {"text": axis}, "zeroline": False, **scale},
@@ -209,16 +212,14 @@ def _stacked(rows: Mapping[str, Mapping[str, float]], axis: str, form: str) -> d
             "type": "bar", "orientation": "h", "name": cause, "marker": {"color": CAUSE_COLOURS[cause]},
             "y": [*rows],
             "x": [round(row.get(cause, 0.0), 4) for row in rows.values()],
-            "hovertemplate": f"{cause}: %{{x:{form}}}",
+            "hovertemplate": f"%{{x:{form}}}",
         }
         for cause in causes
     ]  # fmt: skip
     yaxis = {"autorange": "reversed", "type": "category"}
-    layout = {"barmode": "stack", "height": 140 + 40 * len(rows), "bargap": 0.35, "showlegend": True, "yaxis": yaxis}
-    return {
-        "data": data,
-        "layout": layout | {"xaxis": {"title": {"text": axis}, "tickformat": form, "zeroline": False}},
-    }
+    xaxis = {"title": {"text": axis}, "tickformat": form, "zeroline": False}
+    layout = {"barmode": "stack", "height": 140 + _BAR_PX * len(rows), "bargap": 0.35, "showlegend": True}
+    return {"data": data, "layout": layout | {"meta": {"row": _BAR_PX}, "xaxis": xaxis, "yaxis": yaxis}}
 
 
 def _endings(runs: Sequence[ReportedRun]) -> Plot | None:
